@@ -1,0 +1,54 @@
+PYTHON ?= python3.11
+VENV := .venv
+BIN := $(VENV)/bin
+NETCONVERT := $(BIN)/netconvert --offset.disable-normalization true --no-turnarounds true
+# Threads of the linear algebra library only cost time here: the matrices are tiny.
+export OPENBLAS_NUM_THREADS := 1
+
+.PHONY: demo test check format networks lock wheel benchmark clean
+
+demo: $(VENV)/.installed
+	$(BIN)/sumo-cohesion compare stalled --seeds 0:10 --out demo
+	@echo "The picture is demo/paths.png"
+
+test: $(VENV)/.installed
+	$(BIN)/python -m pytest -q
+
+check: $(VENV)/.installed
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+	$(BIN)/python -m pytest -q --cov --cov-report=term:skip-covered --cov-fail-under=85
+
+format: $(VENV)/.installed
+	$(BIN)/ruff format .
+	$(BIN)/ruff check --fix .
+
+# The comment that netconvert writes holds a date and file paths: leave it out,
+# so that the result depends on the sources alone.
+networks: $(VENV)/.installed
+	cd networks && for n in *.nod.xml; do \
+	  b=$${n%.nod.xml}; \
+	  ../$(NETCONVERT) -n $$b.nod.xml -e $$b.edg.xml $$(test -f $$b.con.xml && echo -x $$b.con.xml) -o $$b.net.xml && \
+	  sed -i '/^<!--/,/^-->/d' $$b.net.xml; done
+	cd tests/networks && ../../$(NETCONVERT) -n curve.nod.xml -e curve.edg.xml -x curve.con.xml -o curve.net.xml && \
+	  sed -i '/^<!--/,/^-->/d' curve.net.xml
+
+lock: $(VENV)/.installed
+	$(BIN)/uv pip compile pyproject.toml --all-extras --universal --no-annotate --no-header \
+	  --no-emit-index-url --no-emit-find-links --python-version 3.11 -o requirements.lock
+
+benchmark: $(VENV)/.installed
+	$(BIN)/python benchmarks/rooms.py
+
+wheel: $(VENV)/.installed
+	$(BIN)/python -m build --wheel
+
+$(VENV)/.installed: pyproject.toml requirements.lock
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements.lock
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps -e .
+	touch $@
+
+clean:
+	rm -rf $(VENV) demo dist build

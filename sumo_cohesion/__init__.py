@@ -1,0 +1,1 @@
+"""Socially cohesive driving in SUMO."""

@@ -1,0 +1,12 @@
+"""The two ways a run can go wrong that are not a programming error."""
+
+
+class UserError(Exception):
+    """The user's input is wrong; the message is one line that says what and how to mend it."""
+
+    def __init__(self, message: str) -> None:
+        super().__init__(" ".join(message.split()))
+
+
+class SimulationError(Exception):
+    """SUMO did something that would make the results untrue; the message is one line."""

@@ -1,0 +1,1 @@
+"""Experiments: run the walk many times and keep tables."""

@@ -1,0 +1,118 @@
+"""Every table's columns: name, dtype, unit, meaning. docs/tables.md is made of this."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import pandas as pd
+
+
+class Column(NamedTuple):
+    """One column of a table."""
+
+    name: str
+    dtype: str
+    unit: str
+    meaning: str
+
+
+TRAJECTORY = (
+    Column("time", "float64", "s", "SUMO time"),
+    Column("vehicle", "string", "", "SUMO id; the ego is 'ego'"),
+    Column("visible", "bool", "", "the ego's perception saw it"),
+    Column("x", "float64", "m", "centre, east"),
+    Column("y", "float64", "m", "centre, north"),
+    Column("heading", "float64", "rad", "counter-clockwise from east"),
+    Column("speed", "float64", "m/s", "as SUMO reports it"),
+    Column("s", "float64", "m", "centre, along the ego's route"),
+    Column("d", "float64", "m", "centre, left of the reference line"),
+    Column("road_heading", "float64", "rad", "heading relative to the road"),
+    Column("lane", "int64", "", "nearest lane of the route, 0 = rightmost; exits come last"),
+    Column("length", "float64", "m", "vehicle length"),
+    Column("width", "float64", "m", "vehicle width"),
+)
+
+PLAN = (
+    Column("time", "float64", "s", "SUMO time at which the plan was made"),
+    Column("status", "string", "", "'solved', 'sumo', or why the plan is a fallback"),
+    Column("fallback", "bool", "", "the ego braked in lane because there was no usable plan"),
+    Column("iterations", "int64", "", "solver iterations"),
+    Column("curvature", "float64", "1/m", "driven control; NaN if SUMO drives"),
+    Column("acceleration", "float64", "m/s²", "driven control, before friction; NaN if SUMO drives"),
+    Column("road_right", "float64", "m", "d of the drivable strip's right edge at the ego"),
+    Column("road_left", "float64", "m", "d of the drivable strip's left edge at the ego"),
+    Column("on_exit", "bool", "", "the ego's nearest lane is not one of its route"),
+    Column("reward_lane", "float64", "", "reward term over the horizon, weighted"),
+    Column("reward_edge", "float64", "", "reward term over the horizon, weighted"),
+    Column("reward_speed", "float64", "", "reward term over the horizon, weighted"),
+    Column("reward_car", "float64", "", "reward term over the horizon, weighted"),
+    Column("reward_curvature", "float64", "", "reward term over the horizon, weighted"),
+    Column("reward_acceleration", "float64", "", "reward term over the horizon, weighted"),
+    Column("reward_cohesion", "float64", "", "cohesion term, beta included"),
+)
+
+AGREEMENT = (
+    Column("time", "float64", "s", "SUMO time"),
+    Column("group", "string", "", "position, lane or road"),
+    Column("feature", "string", "", "social feature"),
+    Column("n", "int64", "", "cars that voted"),
+    Column("mean", "float64", "", "sample mean of the normalised feature"),
+    Column("variance", "float64", "", "unbiased sample variance"),
+    Column("weight", "float64", "", "1 / (variance + floor); 0: the group has no vote on it"),
+    Column("own", "float64", "", "the ego's value if it keeps its course"),
+    Column("pull", "float64", "", "beta · weight · (mean − own)²: what ignoring it would cost"),
+)
+
+TIMING = (
+    Column("time", "float64", "s", "SUMO time"),
+    Column("perception_ms", "float64", "ms", "scene to observation and history"),
+    Column("social_ms", "float64", "ms", "groups, features, agreement"),
+    Column("solver_ms", "float64", "ms", "inside the solver"),
+    Column("plan_ms", "float64", "ms", "the planner's whole call"),
+    Column("sumo_ms", "float64", "ms", "SUMO's step, and reading the next scene"),
+)
+
+METRICS = (
+    Column("scenario", "string", "", "scenario name"),
+    Column("planner", "string", "", "planner name"),
+    Column("seed", "int64", "", "seed of demand and SUMO"),
+    Column("success", "bool", "", "every condition of the scenario's [success] holds"),
+    Column("outcome", "string", "", "why the run ended: collision, finished, route_end"),
+    Column("collision", "bool", "", "the ego's box touched another's"),
+    Column("collision_with", "string", "", "id of the car touched, empty if none"),
+    Column("collision_time", "float64", "s", "seconds after the start; NaN if none"),
+    Column("collision_visible", "bool", "", "the car touched was one the ego could see"),
+    Column("sumo_collision", "bool", "", "SUMO itself reported a contact of the ego"),
+    Column("off_road", "bool", "", "the ego's side left the drivable strip"),
+    Column("exited", "bool", "", "the ego ended on a lane that is not of its route"),
+    Column("distance", "float64", "m", "driven along the route"),
+    Column("travel_time", "float64", "s", "from start to end of the run"),
+    Column("mean_speed", "float64", "m/s", "distance / travel time"),
+    Column("lane_changes", "int64", "", "changes of the ego's nearest lane"),
+    Column("min_gap", "float64", "m", "smallest bumper-to-bumper gap to a car ahead in its path"),
+    Column("min_ttc", "float64", "s", "smallest time to collision; NaN if never closing in"),
+    Column("max_drac", "float64", "m/s²", "largest deceleration needed to avoid a crash"),
+    Column("pet", "float64", "s", "smallest post-encroachment time behind another; NaN if none"),
+    Column("max_jerk", "float64", "m/s³", "largest change of the ego's acceleration"),
+    Column("max_lateral_acceleration", "float64", "m/s²", "largest speed · yaw rate of the ego"),
+    Column("human_mean_speed", "float64", "m/s", "mean over humans that ever moved"),
+    Column("human_hard_brakes", "int64", "", "times a human began to brake harder than 4.5 m/s²"),
+    Column("plan_failures", "int64", "", "steps driven by the fallback"),
+    Column("plan_ms_median", "float64", "ms", "planner's call, median"),
+    Column("plan_ms_p99", "float64", "ms", "planner's call, 99th percentile"),
+)
+
+TABLES = {
+    "trajectory": TRAJECTORY,
+    "plan": PLAN,
+    "agreement": AGREEMENT,
+    "timing": TIMING,
+    "metrics": METRICS,
+}
+
+
+def as_table(name: str, data: dict[str, object] | list[dict[str, object]]) -> pd.DataFrame:
+    """Make a DataFrame with exactly the columns and dtypes of the named table."""
+    columns = TABLES[name]
+    frame = pd.DataFrame(data, columns=[c.name for c in columns])
+    return frame.astype({c.name: c.dtype for c in columns})

@@ -1,0 +1,173 @@
+"""Metrics: pure functions of the saved tables.
+
+Surrogate safety measures as in SUMO's SSM device
+(https://sumo.dlr.de/docs/Simulation/Output/SSM_Device.html), computed from the driven states.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from sumo_cohesion.experiments.columns import as_table
+from sumo_cohesion.state import FloatArray
+
+HARD_BRAKE = 4.5
+"""m/s², SUMO's default comfortable deceleration: braking harder is not normal driving."""
+_EGO = "ego"
+
+
+def run_metrics(
+    info: Mapping[str, Any], trajectory: pd.DataFrame, plan: pd.DataFrame, timing: pd.DataFrame
+) -> pd.DataFrame:
+    """All metrics of one run: one row, see columns.METRICS."""
+    ego = trajectory[trajectory["vehicle"] == _EGO]
+    others = trajectory[trajectory["vehicle"] != _EGO]
+    touched = info["touched"]
+    start, end = ego["time"].iloc[0], ego["time"].iloc[-1]
+    distance = float(ego["s"].iloc[-1] - ego["s"].iloc[0])
+    row: dict[str, Any] = {
+        "scenario": info["scenario"]["name"],
+        "planner": info["planner"],
+        "seed": info["seed"],
+        "outcome": info["outcome"],
+        "collision": bool(touched),
+        "collision_with": touched[0] if touched else "",
+        "collision_time": float(end - start) if touched else np.nan,
+        "collision_visible": bool(set(touched) - set(info["hidden"])),
+        "sumo_collision": bool(info["touched_by_sumo"]),
+        "off_road": off_road(ego, plan),
+        "exited": bool(ego["lane"].iloc[-1] >= info["n_route_lanes"]),
+        "distance": distance,
+        "travel_time": float(end - start),
+        "mean_speed": distance / float(end - start),
+        "lane_changes": int((np.diff(ego["lane"]) != 0).sum()),
+        **gap_metrics(ego, others),
+        "pet": post_encroachment_time(ego, others),
+        "max_jerk": max_jerk(ego),
+        "max_lateral_acceleration": max_lateral_acceleration(ego),
+        **human_metrics(others, info["hidden"]),
+        "plan_failures": int(plan["fallback"].sum()),
+        "plan_ms_median": float(timing["plan_ms"].median()),
+        "plan_ms_p99": float(timing["plan_ms"].quantile(0.99)),
+    }
+    row["success"] = succeeded(row, info["scenario"]["success"])
+    return as_table("metrics", [row])
+
+
+def succeeded(row: Mapping[str, Any], conditions: Mapping[str, Any]) -> bool:
+    """Tell whether every condition of a scenario's [success] holds; a NaN never does.
+
+    >>> succeeded({"collision": False, "distance": 640.0}, {"distance": {"min": 600}})
+    True
+    """
+    for metric, wanted in conditions.items():
+        value = row[metric]
+        if isinstance(wanted, Mapping):
+            low, high = wanted.get("min"), wanted.get("max")
+            if not (low is None or value >= low) or not (high is None or value <= high):
+                return False
+        elif value != wanted:
+            return False
+    return True
+
+
+def off_road(ego: pd.DataFrame, plan: pd.DataFrame) -> bool:
+    """Tell whether the ego's side was ever beyond an edge of the drivable strip."""
+    d = ego["d"].to_numpy()[: len(plan)]
+    half = ego["width"].to_numpy()[: len(plan)] / 2
+    beyond = (d - half < plan["road_right"]) | (d + half > plan["road_left"])
+    return bool(beyond.any())
+
+
+def gap_metrics(ego: pd.DataFrame, others: pd.DataFrame) -> dict[str, float]:
+    """Smallest gap and time to collision, largest deceleration needed, to cars in the path.
+
+    A car is in the ego's path if it is ahead and their widths overlap. With gap g (m, bumper to
+    bumper) and closing speed v > 0 (m/s): TTC = g / v (s), DRAC = v² / 2g (m/s²). NaN where no
+    car was ever in the path (gap) or none was being closed in on; at contact the gap is 0 and
+    the other two are of the last step before it. Source: SSM device, above.
+    """
+    pair = others.merge(ego, on="time", suffixes=("", "_ego"))
+    gap = pair["s"] - pair["s_ego"] - (pair["length"] + pair["length_ego"]) / 2
+    aside = (pair["d"] - pair["d_ego"]).abs() - (pair["width"] + pair["width_ego"]) / 2
+    in_path = (pair["s"] > pair["s_ego"]) & (aside < 0)
+    gap = gap[in_path]
+    speed = pair["speed"] * np.cos(pair["road_heading"])
+    closing = (pair["speed_ego"] * np.cos(pair["road_heading_ego"]) - speed)[in_path]
+    risky = (closing > 0) & (gap > 0)
+    g, v = gap[risky], closing[risky]
+    return {
+        "min_gap": _least(gap.clip(lower=0.0)),
+        "min_ttc": _least(g / v),
+        "max_drac": -_least(-(v**2) / (2 * g)),
+    }
+
+
+def _least(values: pd.Series) -> float:
+    return float(values.min()) if len(values) else np.nan
+
+
+def post_encroachment_time(ego: pd.DataFrame, others: pd.DataFrame) -> float:
+    """Smallest time (s) from another car's rear leaving a place to the ego's front entering it.
+
+    Only places that both cover sideways count; NaN if the ego never follows anyone.
+    Source: SSM device, above (PET).
+    """
+    smallest = np.nan
+    front = (ego["s"] + ego["length"] / 2).to_numpy()
+    time, d, half = ego["time"].to_numpy(), ego["d"].to_numpy(), ego["width"].to_numpy() / 2
+    for _, car in others.groupby("vehicle", sort=False):
+        rear = (car["s"] - car["length"] / 2).to_numpy()
+        # A car that stands leaves nothing; keep the last moment at each place.
+        moving = np.concatenate((np.diff(rear) > 1e-3, [False]))
+        if moving.sum() < 2:
+            continue
+        rear, t, at = rear[moving], car["time"].to_numpy()[moving], car["d"].to_numpy()[moving]
+        left = np.interp(front, rear, t, left=np.nan, right=np.nan)
+        aside = np.abs(np.interp(front, rear, at) - d)
+        pet = (time - left)[aside < half + float(car["width"].iloc[0]) / 2]
+        pet = pet[pet >= 0]
+        if pet.size:
+            smallest = float(np.fmin(smallest, pet.min()))
+    return smallest
+
+
+def max_jerk(ego: pd.DataFrame) -> float:
+    """Largest |change of acceleration| per second (m/s³), by differences of the speed."""
+    return _peak(_rate(_rate(ego["speed"].to_numpy(), ego), ego))
+
+
+def max_lateral_acceleration(ego: pd.DataFrame) -> float:
+    """Largest |speed · yaw rate| (m/s²)."""
+    heading = np.unwrap(ego["heading"].to_numpy())
+    return _peak(ego["speed"].to_numpy()[1:] * _rate(heading, ego))
+
+
+def _rate(values: FloatArray, table: pd.DataFrame) -> FloatArray:
+    """Differences per second; the table gives the step."""
+    step = table["time"].iloc[1] - table["time"].iloc[0]
+    return np.asarray(np.diff(values) / step)
+
+
+def _peak(values: FloatArray) -> float:
+    return float(np.abs(values).max()) if values.size else 0.0
+
+
+def human_metrics(others: pd.DataFrame, hidden: list[str]) -> dict[str, float]:
+    """Mean speed of the humans near the ego, and how often one began to brake hard."""
+    humans = others[~others["vehicle"].isin(hidden)]
+    moved = humans.groupby("vehicle")["speed"].transform("max") > 0.1
+    humans = humans[moved]
+    brakes = 0
+    for _, car in humans.groupby("vehicle", sort=False):
+        time, speed = car["time"].to_numpy(), car["speed"].to_numpy()
+        step = np.diff(time)
+        # A car may leave the range and come back: such a gap is no braking.
+        hard = (np.diff(speed) / step < -HARD_BRAKE - 1e-6) & (step < 0.15)
+        brakes += int((hard & ~np.concatenate(([False], hard[:-1]))).sum())
+    speed = float(humans["speed"].mean()) if len(humans) else np.nan
+    return {"human_mean_speed": speed, "human_hard_brakes": brakes}

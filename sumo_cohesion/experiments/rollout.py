@@ -1,0 +1,255 @@
+"""What one run leaves behind: tables, metrics and a description, in memory or in a folder."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import shutil
+import tempfile
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pandas as pd
+
+from sumo_cohesion.errors import UserError
+from sumo_cohesion.experiments.columns import as_table
+from sumo_cohesion.experiments.metrics import run_metrics
+from sumo_cohesion.road import Road
+from sumo_cohesion.state import Control, Observation, Plan, RoadState, Scene
+from sumo_cohesion.traffic.demand import EGO
+
+if TYPE_CHECKING:
+    from sumo_cohesion.experiments.simulation import Setup
+
+RUN_FILE = "run.json"
+_NO_CONTROL = Control(float("nan"), float("nan"))
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """The complete record of one run.
+
+    Attributes
+    ----------
+    info : scenario, planner, settings, seed, versions and outcome, ready for JSON.
+    trajectory, plan, agreement, timing, metrics : tables; see docs/tables.md for their columns.
+    """
+
+    info: dict[str, Any]
+    trajectory: pd.DataFrame
+    plan: pd.DataFrame
+    agreement: pd.DataFrame
+    timing: pd.DataFrame
+    metrics: pd.DataFrame
+
+    def write(self, folder: Path) -> Path:
+        """Write run.json and one parquet file per table, all of them or none."""
+        if (folder / RUN_FILE).exists() or not folder.exists():
+            pass
+        elif not folder.is_dir() or any(folder.iterdir()):
+            raise UserError(f"{folder}: not a run's folder and not empty; choose another --out")
+        with whole_folder(folder) as new:
+            for name in ("trajectory", "plan", "agreement", "timing", "metrics"):
+                getattr(self, name).to_parquet(new / f"{name}.parquet", index=False)
+            text = json.dumps(self.info, indent=2, ensure_ascii=False)
+            (new / RUN_FILE).write_text(text + "\n", encoding="utf-8")
+        return folder
+
+    @staticmethod
+    def read(folder: Path) -> Rollout:
+        """Read a folder that `write` wrote."""
+        try:
+            info = json.loads((folder / RUN_FILE).read_text(encoding="utf-8"))
+            names = ("trajectory", "plan", "agreement", "timing", "metrics")
+            tables = {name: pd.read_parquet(folder / f"{name}.parquet") for name in names}
+        except (OSError, ValueError) as error:
+            raise UserError(f"{folder}: not a complete run ({error}); run it again") from None
+        return Rollout(info=info, **tables)
+
+
+class whole_folder:  # noqa: N801 - reads as a function where it is used
+    """Context: write into a temporary sibling that replaces ``folder`` only if all went well."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+
+    def __enter__(self) -> Path:
+        try:
+            self._folder.parent.mkdir(parents=True, exist_ok=True)
+            name = f".{self._folder.name}-"
+            self._new = Path(tempfile.mkdtemp(prefix=name, dir=self._folder.parent))
+            self._new.chmod(0o755)
+        except OSError as error:
+            raise UserError(
+                f"{self._folder}: cannot write there ({error.strerror}); choose another --out"
+            ) from None
+        return self._new
+
+    def __exit__(self, kind: type[BaseException] | None, error: object, trace: object) -> None:
+        if kind is None:
+            old = self._new.with_name(self._new.name + "-old")
+            if self._folder.exists():
+                self._folder.rename(old)
+            self._new.rename(self._folder)
+            shutil.rmtree(old, ignore_errors=True)
+            return
+        shutil.rmtree(self._new, ignore_errors=True)
+        if isinstance(error, OSError):
+            raise UserError(
+                f"{self._folder}: cannot write there ({error.strerror or error}); "
+                "free some space or choose another --out"
+            ) from None
+
+
+def versions() -> dict[str, str]:
+    """Versions of everything that can change a result."""
+    packages = ("sumo-cohesion", "libsumo", "casadi", "numpy", "scipy", "pandas")
+    return {"python": platform.python_version()} | {name: version(name) for name in packages}
+
+
+class Recorder:
+    """Collects the steps of one run and turns them into tables at its end."""
+
+    def __init__(self, road: Road, ego_size: tuple[float, float]) -> None:
+        self._road = road
+        self._ego_size = ego_size
+        self._scenes: list[Scene] = []
+        self._visible: list[frozenset[str]] = []
+        self._plans: list[tuple[float, RoadState, Plan]] = []
+        self._seconds: list[tuple[float, float, float]] = []
+
+    def add(
+        self,
+        scene: Scene,
+        observation: Observation,
+        plan: Plan,
+        seconds: tuple[float, float, float],
+    ) -> None:
+        """Record one step; ``seconds`` spent on perception, planning and SUMO."""
+        self._scenes.append(scene)
+        self._visible.append(frozenset(observation.ids))
+        self._plans.append((scene.time, observation.ego, plan))
+        self._seconds.append(seconds)
+
+    def finish(
+        self,
+        setup: Setup,
+        last: Scene,
+        outcome: str,
+        touched: list[str],
+        reported: list[str],
+    ) -> Rollout:
+        """Build the rollout; ``last`` is the scene after the last step."""
+        self._scenes.append(last)
+        self._visible.append(self._visible[-1])
+        trajectory = self._trajectory()
+        plan, agreement, timing = self._plan_table(), self._agreement_table(), self._timing_table()
+        info = {
+            "scenario": setup.scenario.model_dump(mode="json"),
+            "planner": setup.planner_name,
+            "settings": setup.settings.model_dump(mode="json"),
+            "cohesion": setup.cohesion.model_dump(mode="json"),
+            "seed": setup.seed,
+            "outcome": outcome,
+            "touched": touched,
+            "touched_by_sumo": reported,
+            "hidden": list(setup.scenario.sensing.hidden),
+            "n_route_lanes": setup.road.n_route_lanes,
+            "versions": versions(),
+        }
+        metrics = run_metrics(info, trajectory, plan, timing)
+        return Rollout(info, trajectory, plan, agreement, timing, metrics)
+
+    def _trajectory(self) -> pd.DataFrame:
+        counts = np.array([len(scene.ids) for scene in self._scenes])
+        others = np.concatenate([scene.states for scene in self._scenes])
+        sizes = np.concatenate([scene.sizes for scene in self._scenes])
+        egos = np.array([scene.ego for scene in self._scenes])
+        states = np.concatenate((egos, others))
+        frenet, _ = self._road.to_frenet(states)
+        times = np.array([scene.time for scene in self._scenes])
+        step = np.arange(len(self._scenes))
+        names = [name for scene in self._scenes for name in scene.ids]
+        seen = [n in v for scene, v in zip(self._scenes, self._visible, strict=True) for n in scene.ids]
+        columns = {
+            "time": np.concatenate((times, np.repeat(times, counts))),
+            "vehicle": [EGO] * len(egos) + names,
+            "visible": [True] * len(egos) + seen,
+            "x": states[:, 0],
+            "y": states[:, 1],
+            "heading": states[:, 2],
+            "speed": states[:, 3],
+            "s": frenet[:, 0],
+            "d": frenet[:, 1],
+            "road_heading": frenet[:, 2],
+            "lane": self._road.lane_index(frenet[:, 0], frenet[:, 1]),
+            "length": np.concatenate((np.full(len(egos), self._ego_size[0]), sizes[:, 0])),
+            "width": np.concatenate((np.full(len(egos), self._ego_size[1]), sizes[:, 1])),
+        }
+        order = np.argsort(np.concatenate((step, np.repeat(step, counts))), kind="stable")
+        return as_table("trajectory", dict(columns)).iloc[order].reset_index(drop=True)
+
+    def _plan_table(self) -> pd.DataFrame:
+        ego = np.array([state for _, state, _ in self._plans])
+        right, left = self._road.drivable_at(ego[:, 0], ego[:, 1])
+        on_exit = self._road.lane_index(ego[:, 0], ego[:, 1]) >= self._road.n_route_lanes
+        rows = []
+        for i, (time, _, plan) in enumerate(self._plans):
+            control = plan.controls[0] if plan.controls else _NO_CONTROL
+            row: dict[str, object] = {
+                "time": time,
+                "status": plan.status,
+                "fallback": plan.fallback,
+                "iterations": plan.iterations,
+                "curvature": control.curvature,
+                "acceleration": control.acceleration,
+                "road_right": right[i],
+                "road_left": left[i],
+                "on_exit": on_exit[i],
+            }
+            row.update({f"reward_{name}": value for name, value in plan.reward.items()})
+            rows.append(row)
+        return as_table("plan", rows)
+
+    def _agreement_table(self) -> pd.DataFrame:
+        rows: list[dict[str, object]] = [
+            {
+                "time": time,
+                "group": row.group,
+                "feature": row.feature,
+                "n": row.n,
+                "mean": row.mean,
+                "variance": row.variance,
+                "weight": row.weight,
+                "own": row.own,
+                "pull": row.pull,
+            }
+            for time, _, plan in self._plans
+            for row in plan.agreement
+        ]
+        return as_table("agreement", rows)
+
+    def _timing_table(self) -> pd.DataFrame:
+        milliseconds = 1e3 * np.array(self._seconds).reshape(-1, 3)
+        return as_table(
+            "timing",
+            {
+                "time": [time for time, _, _ in self._plans],
+                "perception_ms": milliseconds[:, 0],
+                "social_ms": [1e3 * plan.social_time for _, _, plan in self._plans],
+                "solver_ms": [1e3 * plan.wall_time for _, _, plan in self._plans],
+                "plan_ms": milliseconds[:, 1],
+                "sumo_ms": milliseconds[:, 2],
+            },
+        )
+
+
+def free_bytes(folder: Path) -> int:
+    """Bytes free where a folder is or will be."""
+    while not folder.exists():
+        folder = folder.parent
+    return shutil.disk_usage(os.fspath(folder)).free

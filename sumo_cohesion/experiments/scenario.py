@@ -1,0 +1,227 @@
+"""A scenario is data: a TOML file, validated, with errors that say what and how to mend."""
+
+from __future__ import annotations
+
+import difflib
+import tomllib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, ValidationError, model_validator
+
+from sumo_cohesion.errors import UserError
+from sumo_cohesion.experiments.columns import METRICS
+from sumo_cohesion.planning.settings import PlannerSettings
+from sumo_cohesion.social.settings import CohesionSettings
+from sumo_cohesion.traffic.demand import EgoDemand, Randomization
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+
+
+Model = TypeVar("Model", bound=BaseModel)
+
+
+class _Data(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class Sensing(_Data):
+    """What the ego perceives.
+
+    ``range`` (m) between centres; ``hidden`` vehicles exist but are never seen; ``special``
+    vehicles are seen and avoided, but nobody follows them.
+    """
+
+    range: Positive = 150.0
+    hidden: tuple[str, ...] = ()
+    special: tuple[str, ...] = ()
+
+
+class Bounds(_Data):
+    """A metric lies between ``min`` and ``max``, both included."""
+
+    min: float | None = None
+    max: float | None = None
+
+    @model_validator(mode="after")
+    def _not_empty(self) -> Bounds:
+        if self.min is None and self.max is None:
+            raise ValueError("give min, max or both")
+        return self
+
+
+class Scenario(_Data):
+    """Network, demand, ego, perception and what counts as success.
+
+    Attributes
+    ----------
+    network, routes, additional : file names, looked up beside the scenario, then among the
+        bundled ones.
+    duration : seconds after the ego's departure.
+    lateral_resolution : width (m) of SUMO's sublanes.
+    success : each key a metric, each value what it must be: a value or {min, max}.
+    """
+
+    name: str
+    summary: str
+    network: str
+    routes: Annotated[tuple[str, ...], Field(min_length=1)]
+    additional: tuple[str, ...] = ()
+    duration: Annotated[float, Field(ge=1, le=86_400)]
+    lateral_resolution: Annotated[float, Field(gt=0, le=10)] = 0.8
+    ego: EgoDemand
+    sensing: Sensing = Sensing()
+    randomize: Randomization = Randomization()
+    success: dict[str, bool | float | Bounds]
+    _folder: Path = PrivateAttr(default=Path())
+
+    @model_validator(mode="after")
+    def _known_metrics(self) -> Scenario:
+        names = [c.name for c in METRICS]
+        for name in self.success:
+            if name not in names:
+                raise ValueError(f"success: there is no metric {name!r}{_closest(name, names)}")
+        return self
+
+    def file(self, name: str, kind: str) -> Path:
+        """Path of a network or route file, beside the scenario or bundled (kind: folder)."""
+        for path in (self._folder / name, bundled(kind) / name):
+            if path.is_file():
+                return path
+        raise UserError(
+            f"scenario {self.name!r}: no file {name!r} beside it ({self._folder}) nor among the "
+            f"bundled {kind}"
+        )
+
+
+def bundled(kind: str) -> Path:
+    """Folder of the bundled scenarios, networks or routes: in the wheel, or in the checkout."""
+    package = Path(__file__).resolve().parent.parent
+    inside = package / "data" / kind
+    return inside if inside.is_dir() else package.parent / kind
+
+
+def scenario_files() -> list[Path]:
+    """All bundled scenarios, by name."""
+    return sorted(bundled("scenarios").glob("*.toml"))
+
+
+def load_scenario(source: str | Path, overrides: Mapping[str, Any] | None = None) -> Scenario:
+    """Load a bundled scenario by name or any scenario by its TOML file.
+
+    Parameters
+    ----------
+    source : a name such as "stalled", or a path ending in .toml.
+    overrides : values by dotted name, such as {"randomize.lead_spacing": [40, 40]}.
+
+    Raises
+    ------
+    UserError
+        If there is no such scenario or something in it is wrong.
+    """
+    path = Path(source)
+    if path.suffix != ".toml":
+        names = [p.stem for p in scenario_files()]
+        if str(source) not in names:
+            raise UserError(
+                f"no scenario {str(source)!r}{_closest(str(source), names)}; choose one of "
+                f"{', '.join(names)}, or give the path of a .toml file"
+            )
+        path = bundled("scenarios") / f"{source}.toml"
+    try:
+        data = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read ({error.strerror})") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise UserError(f"{path}: not valid TOML: {error}") from None
+    scenario = validated(Scenario, merge(data, overrides or {}), str(path))
+    scenario._folder = path.parent.resolve()
+    return scenario
+
+
+def settings_from(
+    overrides: Mapping[str, Any],
+) -> tuple[PlannerSettings, CohesionSettings, dict[str, Any]]:
+    """Split dotted overrides into planner settings, cohesion settings and scenario overrides."""
+    parts: dict[str, dict[str, Any]] = {"planner": {}, "cohesion": {}, "": {}}
+    for name, value in overrides.items():
+        head, _, tail = name.partition(".")
+        if tail and head in parts:
+            parts[head][tail] = value
+        else:
+            parts[""][name] = value
+    planner = validated(PlannerSettings, merge({}, parts["planner"]), "planner settings")
+    cohesion = validated(CohesionSettings, merge({}, parts["cohesion"]), "cohesion settings")
+    return planner, cohesion, parts[""]
+
+
+def merge(data: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
+    """Put values into a nested mapping by dotted name; the input is left alone.
+
+    >>> merge({"ego": {"lane": 0}}, {"ego.speed": 20.0})
+    {'ego': {'lane': 0, 'speed': 20.0}}
+    """
+    result = {k: dict(v) if isinstance(v, Mapping) else v for k, v in data.items()}
+    for name, value in overrides.items():
+        head, _, tail = name.partition(".")
+        if not tail:
+            result[head] = value
+            continue
+        inner = result.get(head, {})
+        if not isinstance(inner, Mapping):
+            raise UserError(f"{name}: {head!r} is a value and has no key {tail!r}")
+        result[head] = merge(inner, {tail: value})
+    return result
+
+
+def parse_override(text: str) -> tuple[str, Any]:
+    """Parse ``name=value``, the value as in TOML; a bare word is a string.
+
+    >>> parse_override("cohesion.beta=0.05")
+    ('cohesion.beta', 0.05)
+    >>> parse_override("planner.solver=ipopt")
+    ('planner.solver', 'ipopt')
+    """
+    name, equals, value = text.partition("=")
+    if not equals or not name.strip():
+        raise UserError(f"--set {text!r}: write it as name=value, e.g. cohesion.beta=0.05")
+    try:
+        parsed = tomllib.loads(f"value = {value}")["value"]
+    except tomllib.TOMLDecodeError:
+        parsed = value.strip()
+    return name.strip(), parsed
+
+
+def validated(model: type[Model], data: object, where: str) -> Model:
+    """Validate data; turn pydantic's report into one line."""
+    try:
+        return model.model_validate(data)
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(str(part) for part in first["loc"])
+        if first["type"] == "extra_forbidden":
+            known = _fields_at(model, first["loc"][:-1])
+            name = str(first["loc"][-1])
+            hint = _closest(name, known) or f"; known keys are {', '.join(known)}"
+            raise UserError(f"{where}: unknown key {key!r}{hint}") from None
+        said = first["msg"].removeprefix("Value error, ")
+        got = first.get("input")
+        shown = f" (got {got!r})" if isinstance(got, str | int | float | bool | list) else ""
+        prefix = f"{where}: {key}: " if key else f"{where}: "
+        raise UserError(prefix + said[:1].lower() + said[1:] + shown) from None
+
+
+def _fields_at(model: type[BaseModel], loc: Sequence[int | str]) -> list[str]:
+    """Names of the fields of the sub-model that a validation error's location points to."""
+    for part in loc:
+        inner = model.model_fields.get(str(part))
+        if inner is not None and isinstance(inner.annotation, type):
+            if issubclass(inner.annotation, BaseModel):
+                model = inner.annotation
+    return list(model.model_fields)
+
+
+def _closest(name: str, known: Sequence[str]) -> str:
+    found = difflib.get_close_matches(name, known, n=1)
+    return f"; did you mean {found[0]!r}?" if found else ""

@@ -1,0 +1,201 @@
+"""The loop: SUMO, perception, planner, and back, once per step."""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+
+from sumo_cohesion.errors import UserError
+from sumo_cohesion.experiments.rollout import Recorder, Rollout
+from sumo_cohesion.experiments.scenario import Scenario, load_scenario, settings_from
+from sumo_cohesion.perception.history import History
+from sumo_cohesion.perception.observation import Sensor
+from sumo_cohesion.planning import dynamics
+from sumo_cohesion.planning.planners import Planner, fallback, make_planner
+from sumo_cohesion.planning.settings import PlannerSettings
+from sumo_cohesion.road import Road
+from sumo_cohesion.social.settings import CohesionSettings
+from sumo_cohesion.state import CartesianState, Observation, Plan, Scene
+from sumo_cohesion.traffic.contact import contacts
+from sumo_cohesion.traffic.demand import build_demand, check_demand, write_demand
+from sumo_cohesion.traffic.network import Network
+from sumo_cohesion.traffic.simulator import STEP_LENGTH, Simulator, SumoRun
+
+END_OF_ROUTE = 20.0
+"""Metres before the end of the route at which a run is over; SUMO would remove the ego there."""
+
+
+@dataclass(frozen=True)
+class Setup:
+    """One run, checked and ready: everything that decides its result."""
+
+    scenario: Scenario
+    planner_name: str
+    settings: PlannerSettings
+    cohesion: CohesionSettings
+    seed: int
+    network: Path
+    routes: tuple[Path, ...]
+    additional: tuple[Path, ...]
+    route: tuple[str, ...]
+    road: Road
+
+    def write_inputs(self, folder: Path, gui: bool = False) -> SumoRun:
+        """Write this seed's demand and return what SUMO needs."""
+        scenario = self.scenario
+        fixed = {*scenario.sensing.hidden, *scenario.sensing.special}
+        demand = build_demand(
+            self.routes, self.route, scenario.ego, scenario.randomize, fixed, self.seed
+        )
+        return SumoRun(
+            network=self.network,
+            demand=write_demand(demand, folder),
+            additional=self.additional,
+            seed=self.seed,
+            lateral_resolution=scenario.lateral_resolution,
+            gui=gui,
+        )
+
+
+def prepare(
+    scenario: str | Path,
+    planner: str = "cohesive",
+    seed: int = 0,
+    overrides: Mapping[str, Any] | None = None,
+) -> Setup:
+    """Check everything a run needs before SUMO starts.
+
+    Raises
+    ------
+    UserError
+        If the scenario, its network or demand, the planner or a setting is wrong.
+    """
+    if not 0 <= seed < 2**31:
+        raise UserError(f"seed {seed} is out of range; SUMO takes 0 to 2147483647")
+    settings, cohesion, scenario_overrides = settings_from(overrides or {})
+    loaded = load_scenario(scenario, scenario_overrides)
+    make_planner(planner, settings, cohesion)
+    network_file = loaded.file(loaded.network, "networks")
+    routes = tuple(loaded.file(name, "routes") for name in loaded.routes)
+    additional = tuple(loaded.file(name, "routes") for name in loaded.additional)
+    network = Network(network_file)
+    named = {*loaded.sensing.hidden, *loaded.sensing.special}
+    route = check_demand(network, routes, loaded.ego, named)
+    return Setup(
+        scenario=loaded,
+        planner_name=planner,
+        settings=settings,
+        cohesion=cohesion,
+        seed=seed,
+        network=network_file,
+        routes=routes,
+        additional=additional,
+        route=tuple(route),
+        road=network.road(route),
+    )
+
+
+def run(
+    scenario: str | Path,
+    planner: str = "cohesive",
+    seed: int = 0,
+    *,
+    overrides: Mapping[str, Any] | None = None,
+    out: str | Path | None = None,
+    gui: bool = False,
+) -> Rollout:
+    """Drive one scenario once.
+
+    Parameters
+    ----------
+    scenario : bundled name or path of a TOML file.
+    planner : "nominal", "cohesive", "paper", "sumo" or "module:Class".
+    seed : varies the traffic; the same seed gives every planner the same traffic.
+    overrides : settings by dotted name, e.g. {"cohesion.beta": 0.05}.
+    out : folder to write the run's tables to; nothing is written without it.
+    gui : show SUMO's window.
+
+    Returns
+    -------
+    The rollout: its tables as DataFrames, its metrics as one row.
+
+    Raises
+    ------
+    UserError
+        If the input is wrong.
+    SimulationError
+        If the simulation cannot be trusted.
+    """
+    setup = prepare(scenario, planner, seed, overrides)
+    rollout = simulate(setup, make_planner(planner, setup.settings, setup.cohesion), gui=gui)
+    if out is not None:
+        rollout.write(Path(out))
+    return rollout
+
+
+def simulate(setup: Setup, planner: Planner, *, gui: bool = False) -> Rollout:
+    """Run the loop: observe, remember, plan, drive, step SUMO; until contact or the end."""
+    scenario, road = setup.scenario, setup.road
+    sensing, size = scenario.sensing, (scenario.ego.length, scenario.ego.width)
+    sensor = Sensor(road, sensing.range, set(sensing.hidden), set(sensing.special))
+    history = History(STEP_LENGTH, setup.cohesion.interval, setup.cohesion.memory)
+    recorder = Recorder(setup.road, size)
+    planner.reset(road)
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        Simulator(setup.write_inputs(Path(folder), gui), size, sensing.range + 50.0) as sumo,
+    ):
+        scene = sumo.insert_ego(latest=scenario.ego.depart + 60.0)
+        end, outcome, drives = scene.time + scenario.duration, "", False
+        while not outcome:
+            t0 = perf_counter()
+            observation = sensor.observe(scene)
+            history.push(observation)
+            t1 = perf_counter()
+            plan = _plan(planner, observation, history, setup)
+            t2 = perf_counter()
+            ego = _drive(scene, plan, setup.settings)
+            if ego is not None and not drives:
+                sumo.take_over()
+                drives = True
+            sumo.step(ego)
+            following = sumo.read()
+            t3 = perf_counter()
+            recorder.add(scene, observation, plan, (t1 - t0, t2 - t1, t3 - t2))
+            scene = following
+            touched = contacts(scene.ego, scene.ego_size, scene.states, scene.sizes)
+            if touched.size:
+                outcome = "collision"
+            elif observation.ego.s > road.length - END_OF_ROUTE:
+                outcome = "route_end"
+            elif scene.time > end - STEP_LENGTH / 2:
+                outcome = "finished"
+        names = [scene.ids[i] for i in touched]
+        return recorder.finish(setup, scene, outcome, names, sumo.reported_contacts())
+
+
+def _plan(planner: Planner, observation: Observation, history: History, setup: Setup) -> Plan:
+    """Ask the planner; whatever goes wrong in it, the ego gets a plan and it is counted."""
+    try:
+        plan = planner.plan(observation, history)
+        usable = all(math.isfinite(v) for control in plan.controls[:1] for v in control)
+        status = "control is not finite"
+    except Exception as error:
+        usable, status = False, f"{type(error).__name__}: {error}"
+    return plan if usable else fallback(observation, setup.road, setup.settings, status)
+
+
+def _drive(scene: Scene, plan: Plan, settings: PlannerSettings) -> CartesianState | None:
+    """Where the first planned control takes the ego; None if SUMO drives it."""
+    if not plan.controls:
+        return None
+    x, y, heading, speed = dynamics.step(
+        scene.ego, plan.controls[0], STEP_LENGTH, settings.friction
+    )
+    return CartesianState(float(x), float(y), float(heading), max(float(speed), 0.0))

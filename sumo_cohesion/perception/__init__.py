@@ -1,0 +1,1 @@
+"""Perception: what the ego sees now, and what it has seen."""

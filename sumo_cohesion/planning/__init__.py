@@ -1,0 +1,1 @@
+"""Planning: how to trade the ego's own reward against cohesion."""

@@ -1,0 +1,42 @@
+"""Point-mass dynamics (paper, eq. 3), for floats, NumPy arrays and CasADi symbols alike."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+
+def step(
+    state: Any, control: Any, dt: float, friction: float, road_curvature: Any = 0.0
+) -> tuple[Any, Any, Any, Any]:
+    """Advance a state by one step.
+
+    (x', y', heading', speed') = (speed cos heading, speed sin heading, speed · curvature,
+    acceleration - friction · speed), paper eq. 3, in the road's frame: with road_curvature
+    zero (s, d) are Cartesian coordinates and this is the paper's equation.
+
+    The step is semi-implicit: speed, then heading, then position. With an explicit Euler step
+    the first transition's position does not depend on the first control, and cohesion on it
+    would have no gradient in speed or distance.
+
+    Parameters
+    ----------
+    state : s, d (m), heading (rad), speed (m/s).
+    control : curvature (1/m), acceleration (m/s²).
+    dt : seconds.
+    friction : linear friction (1/s).
+    road_curvature : curvature (1/m) of the reference line at s.
+
+    >>> step((0.0, 0.0, 0.0, 20.0), (0.0, 2.0), 0.1, 0.1)
+    (2.0, 0.0, 0.0, 20.0)
+    """
+    s, d, heading, speed = state
+    curvature, acceleration = control
+    speed = speed + dt * (acceleration - friction * speed)
+    # Metres of s per metre driven along the road: more on the inside of a bend.
+    along = 1.0 / (1.0 - road_curvature * d)
+    heading_next = heading + dt * speed * (curvature - road_curvature * np.cos(heading) * along)
+    s = s + dt * speed * np.cos(heading_next) * along
+    d = d + dt * speed * np.sin(heading_next)
+    return s, d, heading_next, speed

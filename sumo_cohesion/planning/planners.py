@@ -1,0 +1,283 @@
+"""Planners: what drives the ego.
+
+A planner of your own is any class with the two methods of `Planner`; name it
+``package.module:Class`` on the command line.
+"""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from dataclasses import replace
+from pathlib import Path
+from time import perf_counter
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
+
+import numpy as np
+
+from sumo_cohesion.errors import UserError
+from sumo_cohesion.perception.history import History
+from sumo_cohesion.planning.settings import PlannerSettings
+from sumo_cohesion.road import Road
+from sumo_cohesion.social.agreement import Agreement, agreement, combine, elect_lateral
+from sumo_cohesion.social.features import FEATURES, social_features
+from sumo_cohesion.social.groups import group_votes
+from sumo_cohesion.social.settings import PAPER, CohesionSettings
+from sumo_cohesion.state import AgreementRow, Control, FloatArray, Observation, Plan
+
+if TYPE_CHECKING:
+    from sumo_cohesion.planning.mpc import Mpc, Problem, Solution
+
+FALLBACK_BRAKING = 4.0
+"""m/s², braking of the fallback plan."""
+
+
+@runtime_checkable
+class Planner(Protocol):
+    """What a planner must offer."""
+
+    def reset(self, road: Road) -> None:
+        """Start a new run on this road."""
+
+    def plan(self, observation: Observation, history: History) -> Plan:
+        """Decide the ego's controls from what is seen now and what has been seen."""
+
+
+class SumoDriver:
+    """SUMO's own driver model drives the ego: the baseline that SUMO users expect."""
+
+    def reset(self, road: Road) -> None:
+        """Nothing to prepare."""
+
+    def plan(self, observation: Observation, history: History) -> Plan:  # noqa: ARG002
+        """Leave the ego to SUMO."""
+        return Plan(controls=(), states=np.array([observation.ego]), status="sumo")
+
+
+class CohesivePlanner:
+    """The paper's cohesive car: MPC on its own reward plus cohesion (paper, eq. 2).
+
+    With ``cohesion.beta = 0`` it is the nominal car: the same problem, the same solver.
+    """
+
+    def __init__(self, settings: PlannerSettings, cohesion: CohesionSettings) -> None:
+        self.settings = settings
+        self.cohesion = cohesion
+        self._theta = np.array(list(settings.reward.model_dump().values()))
+        self._mpc: Mpc | None = None
+
+    def reset(self, road: Road) -> None:
+        """Build the controller, once per number of lanes, and forget the last run."""
+        from sumo_cohesion.planning.mpc import Mpc
+
+        self._road = road
+        n_lanes = road.lane_centre.shape[1]
+        if self._mpc is None or self._mpc.n_lanes != n_lanes:
+            self._mpc = Mpc(self.settings, n_lanes)
+        self._mpc.reset()
+
+    def plan(self, observation: Observation, history: History) -> Plan:
+        """Plan one step, in the paper's order."""
+        # 1. Who and what: the groups' social features (section III-D and III-B).
+        # 2. When: their agreement, by sample variance (section III-C).
+        start = perf_counter()
+        groups = self._agreements(observation, history) if self.cohesion.beta > 0.0 else ()
+        social_time = perf_counter() - start
+        # 3. How: trade the ego's reward against cohesion (eq. 2) by MPC (section II-A).
+        assert self._mpc is not None, "call reset(road) before plan()"
+        solution = self._mpc.solve(self._problem(observation, groups))
+        # 4. Never without a plan: a failed solve brakes in lane.
+        plan = self._to_plan(observation, solution, groups)
+        return replace(plan, social_time=social_time)
+
+    def _agreements(self, observation: Observation, history: History) -> tuple[Agreement, ...]:
+        votes = group_votes(observation.ego, history, self._road, self.cohesion)
+        groups = tuple(agreement(v, self.cohesion) for v in votes)
+        if self.cohesion.lateral_votes == "most_surprising":
+            groups = elect_lateral(groups)
+        return groups
+
+    def _problem(self, observation: Observation, groups: tuple[Agreement, ...]) -> Problem:
+        from sumo_cohesion.planning.mpc import DT, FAR_AWAY, Problem
+
+        horizon, road, ego = self.settings.horizon, self._road, observation.ego
+        # Where the ego will be if it keeps its speed: the road is looked up there.
+        s = ego.s + DT * ego.speed * np.arange(horizon + 1)
+        lanes = road.lanes_at(s[1:]).T
+        widths = road.lane_width[road.index(s[1:])].T
+        right, left = road.drivable_at(s[1:], np.full(horizon, ego.d))
+        missing = np.isnan(lanes)
+        weight = np.zeros((len(FEATURES), horizon))
+        target = np.zeros((len(FEATURES), horizon))
+        if groups:
+            # The paper's cohesion is on the first transition.
+            term = combine(groups)
+            weight[:, 0] = self.cohesion.beta * term.weight
+            target[:, 0] = term.target
+        return Problem(
+            ego=np.array(ego),
+            ego_width=np.array([observation.ego_size[1]]),
+            road_curvature=road.curvature_at(s[:-1]),
+            lanes=np.where(missing, FAR_AWAY, lanes),
+            lane_widths=np.where(missing, 1.0, widths),
+            right=right,
+            left=left,
+            speed_limit=road.speed_limit_at(s[1:]),
+            cars=self._predict_cars(observation, DT, FAR_AWAY),
+            theta=self._theta,
+            cohesion_weight=weight,
+            cohesion_target=target,
+        )
+
+    def _predict_cars(self, observation: Observation, dt: float, far: float) -> FloatArray:
+        """Predict the nearest cars at constant velocity: (6, N, T), see reward.StageInputs."""
+        horizon, n = self.settings.horizon, self.settings.cars
+        cars = np.zeros((6, n, horizon))
+        cars[0], cars[2], cars[4:] = far, 1.0, 1.0
+        states = observation.states
+        offset = states[:, :2] - (observation.ego.s, observation.ego.d)
+        nearest = np.argsort((offset * offset).sum(axis=1), kind="stable")[:n]
+        s, d, heading, speed = states[nearest].T
+        m = nearest.size
+        ahead = dt * np.arange(1, horizon + 1)
+        stretch = 1.0 - observation.curvature[nearest] * d
+        cos, sin = np.cos(heading), np.sin(heading)
+        cars[0, :m] = s[:, None] + (speed * cos / stretch)[:, None] * ahead
+        cars[1, :m] = d[:, None] + (speed * sin)[:, None] * ahead
+        cars[2, :m] = cos[:, None]
+        cars[3, :m] = sin[:, None]
+        half_sizes = (observation.sizes[nearest] + observation.ego_size) / 2
+        cars[4:, :m] = half_sizes.T[:, :, None]
+        return cars
+
+    def _to_plan(
+        self, observation: Observation, solution: Solution, groups: tuple[Agreement, ...]
+    ) -> Plan:
+        rows = explain(observation, groups, self.cohesion.beta, self._road)
+        if not solution.solved:
+            return fallback(
+                observation,
+                self._road,
+                self.settings,
+                solution.status,
+                solution.iterations,
+                solution.wall_time,
+                rows,
+            )
+        return Plan(
+            controls=tuple(Control(c, a) for c, a in solution.controls.tolist()),
+            states=solution.states,
+            status=solution.status,
+            iterations=solution.iterations,
+            wall_time=solution.wall_time,
+            reward=solution.reward,
+            agreement=rows,
+        )
+
+
+def explain(
+    observation: Observation, groups: tuple[Agreement, ...], beta: float, road: Road
+) -> tuple[AgreementRow, ...]:
+    """Say per group and feature what was agreed and what ignoring it would cost."""
+    if not groups:
+        return ()
+    s, d, heading, speed = observation.ego
+    dt = 0.1
+    curvature = float(road.curvature_at(s))
+    on = (
+        s + dt * speed * np.cos(heading) / (1.0 - curvature * d),
+        d + dt * speed * np.sin(heading),
+        heading,
+        speed,
+    )
+    own = [float(f) for f in social_features(observation.ego, on, dt, curvature)]
+    return tuple(
+        AgreementRow(g.group, name, g.n, m, v, w, o, beta * w * (m - o) ** 2)
+        for g in groups
+        for name, m, v, w, o in zip(
+            FEATURES, g.mean.tolist(), g.variance.tolist(), g.weight.tolist(), own, strict=True
+        )
+    )
+
+
+def fallback(
+    observation: Observation,
+    road: Road,
+    settings: PlannerSettings,
+    status: str,
+    iterations: int = 0,
+    wall_time: float = 0.0,
+    agreement_rows: tuple[AgreementRow, ...] = (),
+) -> Plan:
+    """Plan without a solver: brake in the lane the ego is in."""
+    ego = observation.ego
+    centre = float(road.lanes_at(ego.s)[road.lane_index(ego.s, ego.d)])
+    # Steer so that heading and offset from the lane's centre decay over about two seconds.
+    reach = max(2.0 * ego.speed, 10.0)
+    bend = -2.0 * ego.heading / reach - (ego.d - centre) / reach**2
+    curvature = float(road.curvature_at(ego.s)) + bend
+    curvature = float(np.clip(curvature, -settings.max_curvature, settings.max_curvature))
+    braking = min(FALLBACK_BRAKING, ego.speed / 0.1)
+    control = Control(curvature, settings.friction * ego.speed - braking)
+    return Plan(
+        controls=(control,),
+        states=np.array([ego]),
+        status=status,
+        fallback=True,
+        iterations=iterations,
+        wall_time=wall_time,
+        agreement=agreement_rows,
+    )
+
+
+BUILT_IN = {
+    "nominal": "its own reward only (beta = 0)",
+    "cohesive": "its own reward and cohesion",
+    "paper": "cohesion by the paper's formula as printed",
+    "sumo": "SUMO's own driver model",
+}
+
+
+def make_planner(name: str, settings: PlannerSettings, cohesion: CohesionSettings) -> Planner:
+    """Make a planner by name: a built-in one, or ``module:Class`` called without arguments.
+
+    Raises
+    ------
+    UserError
+        If there is no such planner.
+    """
+    if name == "sumo":
+        return SumoDriver()
+    if name == "nominal":
+        return CohesivePlanner(settings, cohesion.model_copy(update={"beta": 0.0}))
+    if name == "cohesive":
+        return CohesivePlanner(settings, cohesion)
+    if name == "paper":
+        printed = PAPER.model_copy(update={"beta": cohesion.beta})
+        return CohesivePlanner(settings, printed)
+    return _load_planner(name)
+
+
+def _load_planner(name: str) -> Planner:
+    module_name, _, class_name = name.partition(":")
+    if not class_name:
+        raise UserError(
+            f"unknown planner {name!r}; choose {', '.join(BUILT_IN)} or your own as module:Class"
+        )
+    # A user's module usually lies in the folder they work in.
+    here = str(Path.cwd())
+    if here not in sys.path:
+        sys.path.insert(0, here)
+    try:
+        planner = getattr(importlib.import_module(module_name), class_name)()
+    except ImportError as error:
+        raise UserError(f"planner {name!r}: cannot import {module_name!r} ({error})") from None
+    except AttributeError:
+        raise UserError(f"planner {name!r}: {module_name!r} has no {class_name!r}") from None
+    except TypeError as error:
+        raise UserError(
+            f"planner {name!r}: the class must be callable without arguments ({error})"
+        ) from None
+    if not isinstance(planner, Planner):
+        raise UserError(f"planner {name!r} needs the methods reset(road) and plan(observation, history)")
+    return planner

@@ -1,0 +1,60 @@
+"""Settings of the planner: one set for every scenario. SI units."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+
+
+class RewardWeights(BaseModel):
+    """Weights theta of the reward terms phi (paper, eq. 1); each term says its own unit.
+
+    Attributes
+    ----------
+    lane : per lane, reward at its centre.
+    edge : per m², cost beyond the margin at the road's edges.
+    speed : per (m/s)², cost of missing the speed limit.
+    car : cost at the centre of another car.
+    curvature, acceleration : per (1/m)² and (m/s²)², cost of control.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    lane: NonNegative = 1.0
+    edge: NonNegative = 50.0
+    speed: NonNegative = 0.037
+    car: NonNegative = 100.0
+    curvature: NonNegative = 80.0
+    acceleration: NonNegative = 1.2e-4
+
+
+class PlannerSettings(BaseModel):
+    """The model predictive controller.
+
+    Attributes
+    ----------
+    horizon : steps of 0.1 s.
+    friction : linear friction (1/s) of the point mass.
+    max_curvature : bound (1/m) on the driven path's curvature.
+    max_braking, max_acceleration : bounds (m/s²) on the change of speed.
+    cars : how many of the nearest vehicles are avoided.
+    solver : CasADi's interior point methods: fatrop exploits the structure, ipopt is general.
+    max_iterations : after which a solve has failed. Not a time limit, which would make two
+        runs of the same seed differ.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    horizon: Annotated[int, Field(ge=1, le=100)] = 5
+    friction: NonNegative = 0.1
+    max_curvature: Positive = 0.01
+    max_braking: Positive = 8.0
+    max_acceleration: Positive = 4.8
+    cars: Annotated[int, Field(ge=1, le=100)] = 8
+    solver: Literal["fatrop", "ipopt"] = "fatrop"
+    max_iterations: Annotated[int, Field(ge=1)] = 100
+    reward: RewardWeights = RewardWeights()

@@ -1,0 +1,187 @@
+"""The road along the ego's route: a Frenet frame, lanes, drivable edges and limits.
+
+Pure geometry: it knows neither SUMO nor files. ``traffic.network`` builds it from a network.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from math import floor, pi
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial import cKDTree
+
+from sumo_cohesion.state import FloatArray, IntArray
+
+SPACING = 1.0
+"""Metres between vertices of the reference line."""
+
+
+@dataclass(frozen=True)
+class Road:
+    """A curved road in Frenet coordinates.
+
+    The reference line is sampled every metre; between vertices its points and its tangents are
+    interpolated linearly, so that the frame is continuous on both sides of a curve (a plain
+    projection on segments sticks or jumps there), and to_cartesian(to_frenet(p)) returns p.
+
+    Attributes
+    ----------
+    x, y : (G,) vertices of the reference line (m, Cartesian).
+    tangent_x, tangent_y : (G,) unit tangents at the vertices.
+    curvature : (G,) curvature of the reference line (1/m, left positive).
+    s0 : arc length (m) of the first vertex; the route itself starts at s = 0.
+    length : arc length (m) at which the route ends.
+    lane_centre, lane_width : (G, L) lateral position and width (m) of each lane, NaN where the
+        lane does not exist. Lanes off the route that can be reached from it (exits) come last.
+    speed_limit : (G,) limit (m/s).
+    n_route_lanes : how many of the L lanes belong to the route.
+    """
+
+    x: FloatArray
+    y: FloatArray
+    tangent_x: FloatArray
+    tangent_y: FloatArray
+    curvature: FloatArray
+    s0: float
+    length: float
+    lane_centre: FloatArray
+    lane_width: FloatArray
+    speed_limit: FloatArray
+    n_route_lanes: int
+    _tree: cKDTree = field(init=False, repr=False, compare=False)
+    _segments: list[tuple[float, ...]] = field(init=False, repr=False, compare=False)
+    _near: dict[tuple[int, int], int] = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        vertices = np.column_stack((self.x, self.y))
+        tangents = np.column_stack((self.tangent_x, self.tangent_y))
+        heading = np.unwrap(np.arctan2(self.tangent_y, self.tangent_x))
+        rows = np.column_stack((vertices, tangents, heading))
+        # One row per segment: values at its start, then their change along it, then curvature.
+        segments = np.column_stack((rows[:-1], np.diff(rows, axis=0), self.curvature[:-1]))
+        object.__setattr__(self, "_tree", cKDTree(vertices))
+        object.__setattr__(self, "_segments", [tuple(row) for row in segments.tolist()])
+        object.__setattr__(self, "_near", {})
+
+    def index(self, s: ArrayLike) -> IntArray:
+        """Vertex nearest to each arc length s (m)."""
+        i = np.rint((np.asarray(s, float) - self.s0) / SPACING).astype(np.intp)
+        return np.minimum(np.maximum(i, 0), self.x.size - 1)
+
+    def curvature_at(self, s: ArrayLike) -> FloatArray:
+        """Curvature (1/m) of the reference line at arc lengths s (m)."""
+        return self.curvature[self.index(s)]
+
+    def speed_limit_at(self, s: ArrayLike) -> FloatArray:
+        """Speed limit (m/s) at arc lengths s (m)."""
+        return self.speed_limit[self.index(s)]
+
+    def lanes_at(self, s: ArrayLike) -> FloatArray:
+        """Lateral positions (m) of the lane centres at s: shape (..., L), NaN where none is."""
+        return self.lane_centre[self.index(s)]
+
+    def lane_index(self, s: ArrayLike, d: ArrayLike) -> IntArray:
+        """Column of the lane whose centre is nearest to (s, d)."""
+        distance = np.abs(self.lanes_at(s) - np.asarray(d, float)[..., None])
+        distance[np.isnan(distance)] = np.inf
+        return np.asarray(distance.argmin(axis=-1))
+
+    def drivable_at(self, s: ArrayLike, d: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """Right and left border (m) of the paved strip that holds, or is nearest to, (s, d).
+
+        Lanes less than half a metre apart make one strip; an exit that has parted from the
+        route is a strip of its own.
+        """
+        i = self.index(s)
+        centre, half = self.lane_centre[i], self.lane_width[i] / 2
+        right, left = centre - half, centre + half
+        lane = self.lane_index(s, d)[..., None]
+        lower = np.take_along_axis(right, lane, -1)
+        upper = np.take_along_axis(left, lane, -1)
+        for _ in range(centre.shape[-1] - 1):
+            touches = (left > lower - 0.5) & (right < upper + 0.5)
+            lower = np.where(touches, right, np.inf).min(-1, keepdims=True)
+            upper = np.where(touches, left, -np.inf).max(-1, keepdims=True)
+        return lower[..., 0], upper[..., 0]
+
+    def project(self, x: float, y: float) -> tuple[float, float, float, float]:
+        """Road coordinates of one Cartesian point.
+
+        Scalar arithmetic: for the handful of cars around an ego it is several times faster
+        than arrays. Points beyond the ends are measured from the line's extension.
+
+        Returns
+        -------
+        s, d (m), heading (rad) and curvature (1/m) of the reference line there.
+        """
+        # Start from the vertex nearest to the point's 10 m cell, then walk along the line.
+        cell = (int(x // 10.0), int(y // 10.0))
+        i = self._near.get(cell, -1)
+        if i < 0:
+            if len(self._near) > 100_000:
+                self._near.clear()
+            centre = (10.0 * cell[0] + 5.0, 10.0 * cell[1] + 5.0)
+            i = self._near[cell] = min(int(self._tree.query(centre)[1]), len(self._segments) - 1)
+        last = len(self._segments) - 1
+        for _ in range(20):
+            x0, y0, tx0, ty0, h0, ex, ey, tx1, ty1, h1, curvature = self._segments[i]
+            rx, ry = x - x0, y - y0
+            # Foot of the point: (r - u e) . (t0 + u t1) = 0, a quadratic in u whose leading
+            # coefficient is tiny; two Newton steps from the segment's own projection solve it.
+            c0 = rx * tx0 + ry * ty0
+            c1 = rx * tx1 + ry * ty1 - ex * tx0 - ey * ty0
+            c2 = -(ex * tx1 + ey * ty1)
+            u = -c0 / c1
+            if c2:  # zero on a straight segment
+                u -= (c0 + u * (c1 + u * c2)) / (c1 + 2.0 * u * c2)
+                u -= (c0 + u * (c1 + u * c2)) / (c1 + 2.0 * u * c2)
+            step = floor(u)
+            if step == 0 or not 0 <= i + step <= last:
+                break
+            i += step
+        d = (tx0 + u * tx1) * (ry - u * ey) - (ty0 + u * ty1) * (rx - u * ex)
+        return self.s0 + (i + u) * SPACING, d, h0 + u * h1, curvature
+
+    def to_frenet(self, states: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Cartesian to road frame.
+
+        Parameters
+        ----------
+        states : (n, 4) of x, y, heading, speed.
+
+        Returns
+        -------
+        (n, 4) of s, d, heading relative to the road in [-pi, pi), speed; and (n,) the
+        curvature (1/m) of the reference line beside each.
+        """
+        rows = []
+        for x, y, heading, speed in states.tolist():
+            s, d, road_heading, curvature = self.project(x, y)
+            rows.append((s, d, wrap_angle(heading - road_heading), speed, curvature))
+        out = np.array(rows, dtype=float).reshape(-1, 5)
+        return out[:, :4], out[:, 4]
+
+    def to_cartesian(self, states: FloatArray) -> FloatArray:
+        """Road frame to Cartesian: (n, 4) of s, d, heading, speed to x, y, heading, speed."""
+        rows = []
+        for s, d, heading, speed in states.tolist():
+            g = (s - self.s0) / SPACING
+            i = min(max(floor(g), 0), len(self._segments) - 1)
+            u = g - i
+            x0, y0, tx0, ty0, h0, ex, ey, tx1, ty1, h1, _ = self._segments[i]
+            tx, ty = tx0 + u * tx1, ty0 + u * ty1
+            # project() measures d with the interpolated tangent, a hair shorter than one.
+            d /= tx * tx + ty * ty
+            rows.append((x0 + u * ex - d * ty, y0 + u * ey + d * tx, heading + h0 + u * h1, speed))
+        return np.array(rows, dtype=float).reshape(-1, 4)
+
+
+def wrap_angle(angle: float) -> float:
+    """Return the same angle (rad) in [-pi, pi).
+
+    >>> round(wrap_angle(1.5 * pi), 6) == round(-0.5 * pi, 6)
+    True
+    """
+    return (angle + pi) % (2.0 * pi) - pi

@@ -1,0 +1,1 @@
+"""Social: who (groups), what (features) and when (agreement) to follow."""

@@ -1,0 +1,48 @@
+"""Settings of cohesion: one set for every scenario."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+
+
+class CohesionSettings(BaseModel):
+    """Who, what, when and how much to follow.
+
+    Attributes
+    ----------
+    beta : trade-off between the ego's own reward and cohesion (paper, eq. 2); only its ratio
+        to the reward weights matters. Zero is the nominal planner.
+    variance_floor : added to the sample variance of a normalised feature, so that perfect
+        agreement has a finite weight.
+    min_cars : fewest cars that can agree; one car always agrees with itself.
+    lateral_votes : "all": every group votes on lateral features, as in the paper's eq. 2;
+        "most_surprising": only the group whose agreement contradicts lane keeping most.
+    interval : seconds that a human's transition spans.
+    memory : seconds that past transitions are remembered for the position group.
+    position_length, position_width : half sizes (m) of the position group's box.
+    lane_ahead, lane_behind : reach (m) of the lane group.
+    road_reach : reach (m) of the road group, ahead and behind.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    beta: NonNegative = 0.03
+    variance_floor: Positive = 2.5e-3
+    min_cars: Annotated[int, Field(ge=2)] = 2
+    lateral_votes: Literal["all", "most_surprising"] = "most_surprising"
+    interval: Positive = 0.5
+    memory: Positive = 20.0
+    position_length: Positive = 8.0
+    position_width: Positive = 2.5
+    lane_ahead: Positive = 60.0
+    lane_behind: NonNegative = 20.0
+    road_reach: Positive = 60.0
+
+
+PAPER = CohesionSettings(lateral_votes="all", interval=0.1, position_length=3.0, position_width=1.85)
+"""The paper's formula as printed: every group votes on every feature, one-step transitions."""

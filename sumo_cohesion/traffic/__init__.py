@@ -1,0 +1,1 @@
+"""Traffic: the only room that imports SUMO; its conventions stop here."""

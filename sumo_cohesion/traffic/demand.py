@@ -1,0 +1,232 @@
+"""Demand: write the route file of one run, with what its seed varies.
+
+SUMO's demand format: https://sumo.dlr.de/docs/Definition_of_Vehicles,_Vehicle_Types,_and_Routes.html
+"""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from collections.abc import Collection, Sequence
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from sumo_cohesion.errors import UserError
+from sumo_cohesion.traffic.network import Network, check_xml
+
+EGO = "ego"
+"""Id of the ego vehicle and of its vehicle type in SUMO."""
+DEMAND_FILE = "demand.rou.xml"
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+
+
+class EgoDemand(BaseModel):
+    """Where the ego starts and where it goes.
+
+    ``position`` (m) and ``lane`` follow SUMO: front bumper from the start of the edge, lanes
+    counted from the right. ``depart`` (s) leaves other traffic time to form.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    origin: str
+    destination: str
+    lane: Annotated[int, Field(ge=0)]
+    position: NonNegative
+    speed: NonNegative
+    depart: NonNegative = 0.0
+    length: Positive = 5.0
+    width: Positive = 1.8
+
+
+class Randomization(BaseModel):
+    """What a seed varies, besides SUMO's own random numbers.
+
+    Attributes
+    ----------
+    lead_spacing : [low, high] (m) between the fronts of consecutive cars ahead of the ego in
+        its lane, each gap drawn anew; the first gap is the ego's own.
+    position : every other vehicle starts up to so many metres before or after its place.
+    speed : every human's desired speed changes by up to this share.
+    humans : [fewest, most] human cars; the first so many of the route files are kept.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    lead_spacing: tuple[Positive, Positive] | None = None
+    position: NonNegative = 0.0
+    speed: Annotated[float, Field(ge=0, lt=1)] = 0.0
+    humans: tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]] | None = None
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Randomization:
+        for name in ("lead_spacing", "humans"):
+            pair = getattr(self, name)
+            if pair is not None and pair[0] > pair[1]:
+                raise ValueError(f"{name} must be [low, high] with low <= high, not {list(pair)}")
+        return self
+
+
+def check_demand(
+    network: Network, route_files: Sequence[Path], ego: EgoDemand, named: Collection[str]
+) -> list[str]:
+    """Check the demand against the network before SUMO sees either.
+
+    Returns the ego's route. ``named`` are vehicle ids that the scenario speaks of.
+    """
+    route = network.route(ego.origin, ego.destination)
+    n_lanes, length = network.n_lanes(ego.origin), network.edge_length(ego.origin)
+    if ego.lane >= n_lanes:
+        raise UserError(
+            f"ego.lane = {ego.lane}, but edge {ego.origin!r} has lanes 0 to {n_lanes - 1}"
+        )
+    if ego.position > length:
+        raise UserError(
+            f"ego.position = {ego.position:g}, but edge {ego.origin!r} is {length:.1f} m long"
+        )
+    edges = set(network.edges())
+    ids: set[str] = set()
+    for path in route_files:
+        for element in check_xml(path, "routes").iter():
+            if element.tag == "route" or element.get("edges") is not None:
+                for edge in (element.get("edges") or "").split():
+                    if edge not in edges:
+                        raise UserError(
+                            f"{path}: a route uses edge {edge!r}, which {network.path.name} "
+                            "does not have"
+                        )
+            if element.tag in ("vehicle", "trip", "flow"):
+                ids.add(element.get("id", ""))
+    if EGO in ids:
+        raise UserError(f"a route file has a vehicle {EGO!r}; the scenario's [ego] adds it")
+    missing = sorted(set(named) - ids)
+    if missing:
+        raise UserError(f"the scenario names vehicle {missing[0]!r}, which no route file has")
+    return route
+
+
+def build_demand(
+    route_files: Sequence[Path],
+    route: Sequence[str],
+    ego: EgoDemand,
+    randomization: Randomization,
+    fixed: Collection[str],
+    seed: int,
+) -> ET.Element:
+    """Merge route files and the ego into one <routes>, varied by the seed.
+
+    ``fixed`` are vehicles that are not humans (stalled cars, an ambulance): always kept, their
+    speed unchanged. The same seed always gives the same demand.
+    """
+    merged = ET.Element("routes")
+    for path in route_files:
+        merged.extend(check_xml(path, "routes"))
+    rng = np.random.default_rng(seed)
+    others = [v for v in merged if v.tag == "vehicle"]
+    humans = [v for v in others if v.get("id") not in fixed]
+    # Draws are made for every vehicle, kept or not, so that one setting does not shift another's.
+    shift = rng.uniform(-1.0, 1.0, len(others)) * randomization.position
+    pace = 1.0 + rng.uniform(-1.0, 1.0, len(others)) * randomization.speed
+    spacing = randomization.lead_spacing
+    gaps = rng.uniform(*spacing, len(others)) if spacing else np.zeros(len(others))
+    count = rng.integers(randomization.humans[0], randomization.humans[1] + 1) if (
+        randomization.humans
+    ) else len(humans)
+
+    leads = _leads(humans, ego) if spacing else []
+    for vehicle, metres, factor in zip(others, shift, pace, strict=True):
+        if vehicle not in leads:
+            _shift_along(vehicle, float(metres))
+        if vehicle in humans:
+            pace_of = float(vehicle.get("speedFactor", 1.0)) * float(factor)
+            if randomization.speed:
+                vehicle.set("speedFactor", f"{pace_of:.6f}")
+    for vehicle, position in zip(leads, ego.position + np.cumsum(gaps), strict=False):
+        _shift_along(vehicle, float(position) - float(vehicle.get("departPos", 0.0)))
+    for vehicle in humans[int(count) :]:
+        merged.remove(vehicle)
+    _add_ego(merged, route, ego)
+    return merged
+
+
+def write_demand(demand: ET.Element, folder: Path) -> Path:
+    """Write a demand built by build_demand and return the file's path."""
+    path = folder / DEMAND_FILE
+    ET.indent(demand)
+    ET.ElementTree(demand).write(path, encoding="UTF-8", xml_declaration=True)
+    return path
+
+
+def _leads(humans: Sequence[ET.Element], ego: EgoDemand) -> list[ET.Element]:
+    """Humans that start ahead of the ego in its lane, nearest first."""
+
+    def position(vehicle: ET.Element) -> float:
+        return float(vehicle.get("departPos", "nan"))
+
+    ahead = [
+        v
+        for v in humans
+        if v.get("departLane") == str(ego.lane)
+        and _numeric(v.get("departPos"))
+        and position(v) > ego.position
+    ]
+    return sorted(ahead, key=position)
+
+
+def _numeric(text: str | None) -> bool:
+    try:
+        float(text or "")
+    except ValueError:
+        return False
+    return True
+
+
+def _shift_along(vehicle: ET.Element, metres: float) -> None:
+    """Move a vehicle's departure, and the stop it stands at, along its lane."""
+    if metres == 0.0 or not _numeric(vehicle.get("departPos")):
+        return
+    at = max(float(vehicle.get("departPos", 0.0)) + metres, 0.0)
+    vehicle.set("departPos", f"{at:.3f}")
+    for stop in vehicle.iter("stop"):
+        for key in ("startPos", "endPos"):
+            if _numeric(stop.get(key)):
+                stop.set(key, f"{float(stop.get(key, 0.0)) + metres:.3f}")
+
+
+def _add_ego(routes: ET.Element, route: Sequence[str], ego: EgoDemand) -> None:
+    kind = ET.Element(
+        "vType",
+        id=EGO,
+        laneChangeModel="SL2015",
+        length=f"{ego.length:g}",
+        width=f"{ego.width:g}",
+        speedDev="0",
+        color="orange",
+    )
+    routes.insert(0, kind)
+    vehicle = ET.SubElement(
+        routes,
+        "vehicle",
+        id=EGO,
+        type=EGO,
+        depart=f"{ego.depart:g}",
+        departLane=str(ego.lane),
+        departPos=f"{ego.position:g}",
+        departSpeed=f"{ego.speed:g}",
+        insertionChecks="none",
+    )
+    ET.SubElement(vehicle, "route", edges=" ".join(route))
+    # SUMO wants departures in order of time.
+    timed = [e for e in routes if e.get("depart") or e.get("begin")]
+    for element in timed:
+        routes.remove(element)
+    routes.extend(sorted(timed, key=lambda e: _departure(e)))
+
+
+def _departure(element: ET.Element) -> float:
+    text = element.get("depart") or element.get("begin")
+    return float(text or 0.0) if _numeric(text) else 0.0

@@ -1,0 +1,298 @@
+"""The bridge: start SUMO, read a Scene, put the ego where its planner drove it, step, close.
+
+libsumo: https://sumo.dlr.de/docs/Libsumo.html
+moveToXY: https://sumo.dlr.de/docs/TraCI/Change_Vehicle_State.html#move_to_xy_0xb4
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sys
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from math import cos, degrees, hypot, isfinite, pi, radians, sin
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+
+from sumo_cohesion.errors import SimulationError, UserError
+from sumo_cohesion.state import CartesianState, Scene
+from sumo_cohesion.traffic.demand import EGO
+
+STEP_LENGTH = 0.1
+"""Seconds per step, of SUMO and of every planner."""
+OLDEST_SUMO = (1, 24)
+_POSITION_TOLERANCE = 0.05
+"""Metres by which SUMO's ego may differ from the driven one. Measured: below 0.001."""
+_KEEP_ROUTE_EXACT = 2
+"""moveToXY: put the ego exactly there, map it to whatever lane is below, or to none."""
+
+_running: str | None = None
+
+
+@dataclass(frozen=True)
+class SumoRun:
+    """What SUMO needs to start one run."""
+
+    network: Path
+    demand: Path
+    additional: tuple[Path, ...]
+    seed: int
+    lateral_resolution: float
+    gui: bool = False
+
+    def options(self) -> list[str]:
+        """SUMO's command line, without the program.
+
+        The sublane model is always on: without it an ego between two lanes is a phantom to
+        others and collisions are misreported. ``collision.action warn`` leaves both cars in
+        the simulation; the own contact test decides.
+        """
+        pairs: dict[str, object] = {
+            "net-file": self.network,
+            "route-files": self.demand,
+            "step-length": STEP_LENGTH,
+            "lateral-resolution": self.lateral_resolution,
+            "collision.action": "warn",
+            "collision.mingap-factor": 0,
+            "collision.check-junctions": "true",
+            "time-to-teleport": -1,
+            "seed": self.seed,
+            "no-step-log": "true",
+            "no-warnings": "true",
+            "duration-log.disable": "true",
+        }
+        if self.additional:
+            pairs["additional-files"] = ",".join(map(str, self.additional))
+        options = [text for key, value in pairs.items() for text in (f"--{key}", str(value))]
+        return [*options, "--start", "--quit-on-end"] if self.gui else options
+
+    def write_config(self, path: Path) -> None:
+        """Write a .sumocfg that opens this run in plain SUMO, with SUMO driving the ego."""
+        lines = ['<?xml version="1.0" encoding="UTF-8"?>', "<sumoConfiguration>"]
+        options = self.options()
+        for key, value in zip(options[::2], options[1::2], strict=True):
+            if key in ("--net-file", "--route-files", "--additional-files"):
+                value = ",".join(Path(p).name for p in value.split(","))
+            lines.append(f'    <{key[2:]} value="{value}"/>')
+        lines.append("</sumoConfiguration>")
+        path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+class Simulator:
+    """One SUMO simulation; a context manager, at most one per process.
+
+    Raises
+    ------
+    UserError
+        If SUMO rejects the network or the demand.
+    SimulationError
+        If SUMO's ego is not where it was put, or has gone.
+    """
+
+    def __init__(self, run: SumoRun, ego_size: tuple[float, float], radius: float) -> None:
+        self._run = run
+        self._ego_size = ego_size
+        self._radius = radius
+        self._sizes: dict[str, tuple[float, float]] = {}
+        self._driven: CartesianState | None = None
+        self._stepped = True
+        self._sumo: Any = None
+        self._variables: tuple[int, ...] = ()
+
+    def __enter__(self) -> Simulator:
+        global _running
+        if _running is not None:
+            raise SimulationError(
+                "a SUMO simulation is already running in this process, and a second one would "
+                "silently replace it; close it first, or use another process"
+            )
+        libsumo = load_libsumo()
+        program = "sumo-gui" if self._run.gui else "sumo"
+        with _captured_stderr() as said:
+            try:
+                libsumo.start([program, *self._run.options()])
+            except Exception as error:
+                reason = _first_error(said()) or str(error)
+                raise UserError(f"SUMO cannot start this scenario: {reason}") from None
+        _running = self._run.demand.name
+        self._sumo = libsumo
+        tc = libsumo.constants
+        self._variables = (tc.VAR_POSITION, tc.VAR_ANGLE, tc.VAR_SPEED)
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        global _running
+        # A moveToXY that no step has taken up crashes the next simulation in this process.
+        with contextlib.suppress(Exception):
+            if not self._stepped:
+                self._sumo.simulationStep()
+        with contextlib.suppress(Exception):
+            self._sumo.close()
+        _running = None
+
+    def insert_ego(self, latest: float) -> Scene:
+        """Step until SUMO has put the ego on the road and return the first scene.
+
+        ``latest`` (s) is when to give up.
+        """
+        while EGO not in self._sumo.simulation.getDepartedIDList():
+            if self._sumo.simulation.getTime() > latest:
+                raise UserError(
+                    f"SUMO has not inserted the ego by {latest:g} s; its start is blocked, "
+                    "choose another ego.position, ego.lane or ego.depart"
+                )
+            self._step()
+        self._sumo.vehicle.subscribeContext(
+            EGO, self._sumo.constants.CMD_GET_VEHICLE_VARIABLE, self._radius, self._variables
+        )
+        return self.read()
+
+    def take_over(self) -> None:
+        """Switch off SUMO's own control of the ego.
+
+        A high speed factor matters: SUMO reports an ego moved faster than its lane's limit
+        times that factor at the capped speed, and humans follow what is reported.
+        """
+        vehicle = self._sumo.vehicle
+        vehicle.setSpeedFactor(EGO, 3.0)
+        vehicle.setMaxSpeed(EGO, 70.0)
+        vehicle.setSpeedMode(EGO, 0)
+        vehicle.setLaneChangeMode(EGO, 0)
+
+    def step(self, ego: CartesianState | None) -> None:
+        """Advance SUMO by one step, with the ego at the given state (None: SUMO drives it)."""
+        if ego is not None:
+            if not all(map(isfinite, ego)):
+                raise SimulationError(f"the ego would be moved to a place that is no number: {ego}")
+            # SUMO's angles are degrees clockwise from north; its positions are front bumpers.
+            half = self._ego_size[0] / 2
+            front = ego.x + half * cos(ego.heading), ego.y + half * sin(ego.heading)
+            angle = (90.0 - degrees(ego.heading)) % 360.0
+            self._sumo.vehicle.moveToXY(EGO, "", -1, *front, angle, _KEEP_ROUTE_EXACT)
+            self._stepped = False
+        self._driven = ego
+        self._step()
+
+    def read(self) -> Scene:
+        """Read what is around the ego now."""
+        found = self._sumo.vehicle.getContextSubscriptionResults(EGO)
+        if EGO not in found:
+            raise SimulationError("SUMO has removed the ego; it left its route or its network")
+        position, angle, speed = self._variables
+        own = found.pop(EGO)
+        ego = self._centre(own[position], own[angle], own[speed], self._ego_size[0])
+        if self._driven is not None:
+            error = hypot(ego.x - self._driven.x, ego.y - self._driven.y)
+            if not error < _POSITION_TOLERANCE:
+                raise SimulationError(
+                    f"SUMO's ego is {error:.2f} m from where it was driven to; the bridge is broken"
+                )
+            # SUMO's speed is the same to rounding; its heading is that of the last move.
+            ego = self._driven
+        ids = tuple(found)
+        states = [
+            self._centre(row[position], row[angle], row[speed], self._size(name)[0])
+            for name, row in found.items()
+        ]
+        return Scene(
+            time=float(self._sumo.simulation.getTime()),
+            ego=ego,
+            ego_size=self._ego_size,
+            ids=ids,
+            states=np.array(states, dtype=float).reshape(-1, 4),
+            sizes=np.array([self._sizes[name] for name in ids], dtype=float).reshape(-1, 2),
+        )
+
+    def reported_contacts(self) -> list[str]:
+        """Vehicles that SUMO itself says the ego touched in the last step."""
+        pairs = [(c.collider, c.victim) for c in self._sumo.simulation.getCollisions()]
+        return sorted({a if b == EGO else b for a, b in pairs if EGO in (a, b)})
+
+    def _step(self) -> None:
+        try:
+            self._sumo.simulationStep()
+        except Exception as error:
+            raise SimulationError(f"SUMO stopped: {error}") from None
+        self._stepped = True
+
+    def _size(self, name: str) -> tuple[float, float]:
+        if name not in self._sizes:
+            vehicle = self._sumo.vehicle
+            self._sizes[name] = (float(vehicle.getLength(name)), float(vehicle.getWidth(name)))
+        return self._sizes[name]
+
+    @staticmethod
+    def _centre(
+        front: tuple[float, float], angle: float, speed: float, length: float
+    ) -> CartesianState:
+        heading = radians(90.0 - angle)
+        if heading < -pi:
+            heading += 2.0 * pi
+        x = front[0] - length / 2 * cos(heading)
+        y = front[1] - length / 2 * sin(heading)
+        return CartesianState(x, y, heading, speed)
+
+
+def load_libsumo() -> Any:
+    """Import libsumo, quietly, and check that it is recent enough.
+
+    Raises
+    ------
+    UserError
+        If libsumo is missing or too old.
+    """
+    # libsumo prints a warning about pyarrow's version to standard output, which would spoil
+    # --json; this variable, read at import, turns it off (the two are not used together here).
+    os.environ.setdefault("LIBSUMO_AS_TRACI", "quiet")
+    try:
+        import libsumo
+    except ImportError as error:
+        raise UserError(f"libsumo cannot be loaded ({error}); pip install libsumo") from None
+    version = sumo_version(libsumo)
+    if version < OLDEST_SUMO:
+        raise UserError(
+            f"libsumo {libsumo.__version__} is too old; pip install --upgrade 'libsumo>=1.24'"
+        )
+    return libsumo
+
+
+def sumo_version(libsumo: Any) -> tuple[int, int]:
+    """Return SUMO's version as (major, minor)."""
+    major, minor = str(libsumo.__version__).split(".")[:2]
+    return int(major), int(minor)
+
+
+@contextlib.contextmanager
+def _captured_stderr() -> Iterator[Any]:
+    """Catch what SUMO's C++ code prints to standard error; yields a function to read it."""
+    sys.stderr.flush()
+    with tempfile.TemporaryFile() as sink:
+        kept = os.dup(2)
+        os.dup2(sink.fileno(), 2)
+
+        def said() -> str:
+            sink.seek(0)
+            return sink.read().decode(errors="replace")
+
+        try:
+            yield said
+        finally:
+            os.dup2(kept, 2)
+            os.close(kept)
+
+
+def _first_error(text: str) -> str:
+    """Return the first line of SUMO's messages that names an error."""
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
+    errors = [line for line in lines if line.startswith("Error")]
+    return (errors or lines or [""])[0].removeprefix("Error:").strip()
