@@ -16,7 +16,7 @@ import numpy as np
 from sumo_cohesion.planning import dynamics, reward
 from sumo_cohesion.planning.settings import PlannerSettings, RewardWeights
 from sumo_cohesion.social.features import FEATURES, social_features
-from sumo_cohesion.state import Control, FloatArray, RoadState
+from sumo_cohesion.state import FloatArray, RoadState
 
 DT = 0.1
 """Seconds per step."""
@@ -177,16 +177,25 @@ class Mpc:
             return self._failed("input is not finite", 0, 0.0)
         ego = RoadState(*problem.ego)
         lower, upper = self._bounds(ego.speed)
-        guess = self._hold(problem) if self._warm is None else self._warm
+        guesses = [self._hold(problem)]
+        if self._warm is not None:
+            guesses.insert(0, self._warm)
+        iterations, status, solved, z = 0, "", False, np.empty(0)
         start = time.perf_counter()
-        result = self._solver(x0=guess, p=parameters, lbx=lower, ubx=upper, lbg=0.0, ubg=0.0)
+        # A solve that fails from the last solution is tried once more from a fresh start.
+        for guess in guesses:
+            result = self._solver(x0=guess, p=parameters, lbx=lower, ubx=upper, lbg=0.0, ubg=0.0)
+            stats = self._solver.stats()
+            z = np.asarray(result["x"]).ravel()
+            iterations += int(stats["iter_count"])
+            solved = bool(stats["success"]) and bool(np.isfinite(z.sum()))
+            status = f"{self.settings.solver} returned {stats['return_status']}"
+            if solved:
+                break
         wall_time = time.perf_counter() - start
-        stats = self._solver.stats()
-        z = np.asarray(result["x"]).ravel()
-        iterations = int(stats.get("iter_count", 0))
-        if not stats["success"] or not np.isfinite(z.sum()):
+        if not solved:
             self._warm = None
-            return self._failed(str(stats.get("return_status", "failed")), iterations, wall_time)
+            return self._failed(status, iterations, wall_time)
         states, controls = self._unpack(z)
         self._warm = self._shifted(states, controls)
         values = np.asarray(self._terms(z, parameters)).ravel()
@@ -245,8 +254,3 @@ class Mpc:
         rows = z[:-4].reshape(self.settings.horizon, 6)
         states = np.vstack((rows[:, :4], z[-4:]))
         return states, rows[:, 4:] * _CONTROL_SCALE
-
-
-def control_at(controls: FloatArray, t: int) -> Control:
-    """Row t of (T, 2) controls."""
-    return Control(float(controls[t, 0]), float(controls[t, 1]))

@@ -25,7 +25,7 @@ class RewardWeights(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     lane: NonNegative = 1.0
-    edge: NonNegative = 50.0
+    edge: NonNegative = 500.0
     speed: NonNegative = 0.037
     car: NonNegative = 100.0
     curvature: NonNegative = 80.0

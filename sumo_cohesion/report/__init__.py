@@ -1,1 +1,1 @@
-"""report."""
+"""Report: figures, made of saved tables only."""

@@ -1,0 +1,323 @@
+"""The command line. Everything it does is one call in Python."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+# The matrices here are tiny; threads of the linear algebra library would only cost time.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import click
+
+from sumo_cohesion.errors import SimulationError, UserError
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+PLANNER_HELP = "nominal, cohesive, paper, sumo, or your own as module:Class."
+SET_HELP = "Change a setting, e.g. cohesion.beta=0.05, planner.horizon=10, ego.speed=20."
+
+
+@click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
+@click.version_option(package_name="sumo-cohesion")
+def app() -> None:
+    """Socially cohesive driving in SUMO: an ego car that follows what nearby humans agree on."""
+
+
+@app.command()
+def scenarios() -> None:
+    """List the bundled scenarios, one line each."""
+    from sumo_cohesion.experiments.scenario import load_scenario, scenario_files
+
+    for path in scenario_files():
+        click.echo(f"{path.stem:20} {load_scenario(path.stem).summary}")
+
+
+@app.command()
+@click.argument("scenario")
+@click.option("--planner", default="cohesive", show_default=True, help=PLANNER_HELP)
+@click.option("--seed", type=int, default=0, show_default=True, help="Varies the traffic.")
+@click.option("--set", "changes", multiple=True, metavar="NAME=VALUE", help=SET_HELP)
+@click.option("--out", type=click.Path(path_type=Path), help="Folder for the run's tables.")
+@click.option("--gui", is_flag=True, help="Show SUMO's window (needs sumo-cohesion[gui]).")
+@click.option("--json", "as_json", is_flag=True, help="Print the metrics as JSON.")
+def run(
+    scenario: str,
+    planner: str,
+    seed: int,
+    changes: tuple[str, ...],
+    out: Path | None,
+    gui: bool,
+    as_json: bool,
+) -> None:
+    """Drive SCENARIO (a bundled name or a TOML file) once."""
+    from sumo_cohesion.experiments.simulation import run as run_once
+
+    with _clean_stdout():
+        rollout = run_once(scenario, planner, seed, overrides=_overrides(changes), out=out, gui=gui)
+    _warn_of_failures(rollout.plan)
+    row = _records(rollout.metrics)[0]
+    if as_json:
+        click.echo(json.dumps({"metrics": row}, ensure_ascii=False))
+    else:
+        for name, value in row.items():
+            click.echo(f"{name:26} {_shown(value)}")
+    if out is not None:
+        click.echo(f"tables written to {out}", err=True)
+
+
+@app.command()
+@click.argument("scenario")
+@click.option("--planners", default="nominal,cohesive", show_default=True, help=PLANNER_HELP)
+@click.option("--seeds", default="0:20", show_default=True, help="0:20 is half-open; or 3,7,9.")
+@click.option("--workers", type=click.IntRange(min=1), help="Processes. Default: one per core.")
+@click.option("--set", "changes", multiple=True, metavar="NAME=VALUE", help=SET_HELP)
+@click.option("--out", type=click.Path(path_type=Path), help="Default: results/SCENARIO.")
+@click.option("--json", "as_json", is_flag=True, help="Print runs and summary as JSON.")
+def compare(
+    scenario: str,
+    planners: str,
+    seeds: str,
+    workers: int | None,
+    changes: tuple[str, ...],
+    out: Path | None,
+    as_json: bool,
+) -> None:
+    """Run several planners on the same seeds of SCENARIO and compare them."""
+    from sumo_cohesion.experiments.comparison import compare as compare_planners
+    from sumo_cohesion.report.paths import draw_comparison
+
+    folder = out if out is not None else Path("results") / Path(scenario).stem
+    names, numbers = [p.strip() for p in planners.split(",") if p.strip()], parse_seeds(seeds)
+    with _clean_stdout(), _progress(f"{scenario}") as progress:
+        result = compare_planners(
+            scenario,
+            names,
+            numbers,
+            overrides=_overrides(changes),
+            workers=workers,
+            out=folder,
+            progress=progress,
+        )
+        picture = draw_comparison(folder)
+    failures = int(result.runs["plan_failures"].sum())
+    if failures:
+        click.echo(f"note: {failures} steps were driven by the fallback", err=True)
+    if as_json:
+        document = {"runs": _records(result.runs), "summary": _records(result.summary)}
+        click.echo(json.dumps(document, ensure_ascii=False))
+    else:
+        _print_summary(result.summary)
+    click.echo(f"runs and tables in {folder}, picture in {picture}", err=True)
+
+
+@app.command()
+@click.argument("folder", type=click.Path(path_type=Path))
+@click.option(
+    "--format",
+    "style",
+    type=click.Choice(["table", "csv", "parquet", "json"]),
+    default="table",
+    show_default=True,
+)
+@click.option("--out", type=click.Path(path_type=Path), help="File to write (parquet needs it).")
+def metrics(folder: Path, style: str, out: Path | None) -> None:
+    """Print or convert the metrics of all runs below FOLDER."""
+    from sumo_cohesion.experiments.comparison import load_metrics
+
+    frame = load_metrics(folder)
+    if style == "parquet":
+        if out is None:
+            raise UserError("--format parquet writes a file; name it with --out")
+        with _writing(out):
+            frame.to_parquet(out, index=False)
+        return
+    if style == "csv":
+        text = frame.to_csv(index=False)
+    elif style == "json":
+        text = json.dumps(_records(frame), ensure_ascii=False) + "\n"
+    else:
+        text = frame.to_string(index=False) + "\n"
+    if out is None:
+        click.echo(text, nl=False)
+        return
+    with _writing(out):
+        out.write_text(text, encoding="utf-8")
+
+
+@app.command()
+@click.argument("folder", type=click.Path(path_type=Path))
+@click.option("--out", type=click.Path(path_type=Path), help="Picture file, .png, .pdf or .svg.")
+@click.option("--seed", type=int, help="Which seed of a comparison. Default: the first.")
+def figure(folder: Path, out: Path | None, seed: int | None) -> None:
+    """Draw the picture of a run or a comparison from its saved tables."""
+    from sumo_cohesion.report.paths import draw_comparison, draw_run
+
+    draw = draw_comparison if (folder / "comparison.json").is_file() else draw_run
+    if draw is draw_run and seed is not None:
+        raise UserError(f"{folder}: one run has one seed; leave --seed out")
+    path = draw_comparison(folder, out, seed) if draw is draw_comparison else draw_run(folder, out)
+    click.echo(path)
+
+
+@app.group()
+def scenario() -> None:
+    """Work with one scenario."""
+
+
+@scenario.command("export")
+@click.argument("name", metavar="SCENARIO")
+@click.option("--seed", type=int, default=0, show_default=True)
+@click.option("--set", "changes", multiple=True, metavar="NAME=VALUE", help=SET_HELP)
+@click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder to write.")
+def export(name: str, seed: int, changes: tuple[str, ...], out: Path) -> None:
+    """Write SCENARIO for plain SUMO: sumo-gui -c OUT/scenario.sumocfg."""
+    from sumo_cohesion.experiments.export import export_scenario
+
+    click.echo(export_scenario(name, out, seed=seed, overrides=_overrides(changes)))
+
+
+def parse_seeds(text: str) -> list[int]:
+    """Parse "0:20" (half-open) or "3,7,9".
+
+    >>> parse_seeds("0:3"), parse_seeds("3,7,9")
+    ([0, 1, 2], [3, 7, 9])
+    """
+    try:
+        if ":" in text:
+            low, high = (int(part) for part in text.split(":"))
+            seeds = list(range(low, high))
+        else:
+            seeds = [int(part) for part in text.split(",")]
+    except ValueError:
+        raise UserError(f"--seeds {text!r}: write 0:20 for 0 to 19, or a list 3,7,9") from None
+    if not seeds:
+        raise UserError(f"--seeds {text!r} is empty; 0:20 means 0 to 19, the end is not included")
+    return seeds
+
+
+def _overrides(changes: Sequence[str]) -> dict[str, Any]:
+    from sumo_cohesion.experiments.scenario import parse_override
+
+    return dict(parse_override(text) for text in changes)
+
+
+def _records(frame: pd.DataFrame) -> list[dict[str, Any]]:
+    """Rows as JSON has them: a number that is not finite is null."""
+    return [
+        {
+            str(k): None if isinstance(v, float) and not math.isfinite(v) else v
+            for k, v in row.items()
+        }
+        for row in frame.to_dict(orient="records")
+    ]
+
+
+def _shown(value: object) -> str:
+    if value is None:
+        return "-"
+    return f"{value:.3f}" if isinstance(value, float) else str(value)
+
+
+def _warn_of_failures(plan: pd.DataFrame) -> None:
+    failed = plan[plan["fallback"]]
+    if len(failed):
+        click.echo(
+            f"note: the planner failed in {len(failed)} of {len(plan)} steps, first with "
+            f"{failed['status'].iloc[0]!r}; the ego braked in its lane instead",
+            err=True,
+        )
+
+
+def _print_summary(summary: pd.DataFrame) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(title="95 % confidence intervals: Wilson for rates, bootstrap for means")
+    for name in ("metric", *summary["planner"].unique()):
+        table.add_column(name, justify="left" if name == "metric" else "right", no_wrap=True)
+    for metric, rows in summary.groupby("metric", sort=False):
+        cells = [
+            f"{r.value:.2f} [{r.low:.2f}, {r.high:.2f}] n={r.n}" if r.n else "-"
+            for r in rows.itertuples()
+        ]
+        table.add_row(str(metric), *cells)
+    # Wide enough for the table where the output is a file or a pipe.
+    Console(width=None if sys.stdout.isatty() else 140).print(table)
+
+
+@contextmanager
+def _progress(title: str) -> Iterator[Any]:
+    """Show a bar with rate and ETA on a terminal, nothing elsewhere; on standard error."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+    from rich.progress import TimeElapsedColumn, TimeRemainingColumn
+
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TextColumn("ETA"),
+        TimeRemainingColumn(),
+    )
+    console = Console(stderr=True)
+    with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
+        task = bar.add_task(title, total=None)
+        yield lambda done, total: bar.update(task, completed=done, total=total)
+
+
+@contextmanager
+def _clean_stdout() -> Iterator[None]:
+    """Send what native libraries print to standard output to standard error instead."""
+    sys.stdout.flush()
+    kept = os.dup(1)
+    os.dup2(2, 1)
+    try:
+        yield
+    finally:
+        sys.stdout.flush()
+        os.dup2(kept, 1)
+        os.close(kept)
+
+
+@contextmanager
+def _writing(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise UserError(f"{path}: cannot be written ({error.strerror})") from None
+
+
+def main() -> None:
+    """Entry point: 0 done, 2 the user's input is wrong, 1 anything else; always one line."""
+    try:
+        app(standalone_mode=False)
+    except click.exceptions.Exit as stop:
+        sys.exit(stop.exit_code)
+    except click.exceptions.NoArgsIsHelpError as stop:
+        click.echo(stop.ctx.get_help() if stop.ctx else "")
+        sys.exit(2)
+    except click.ClickException as error:
+        _fail(f"{error.format_message()} (sumo-cohesion --help)", 2)
+    except UserError as error:
+        _fail(str(error), 2)
+    except SimulationError as error:
+        _fail(str(error), 1)
+    except (KeyboardInterrupt, click.Abort):
+        _fail("interrupted", 1)
+    except BrokenPipeError:
+        sys.stderr.close()
+        sys.exit(1)
+
+
+def _fail(message: str, status: int) -> None:
+    click.echo("error: " + " ".join(message.split()), err=True)
+    sys.exit(status)

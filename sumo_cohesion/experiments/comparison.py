@@ -1,0 +1,219 @@
+"""Paired comparison: the same seeds, the same traffic, several planners, side by side."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+import shutil
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from sumo_cohesion.errors import SimulationError, UserError
+from sumo_cohesion.experiments.rollout import RUN_FILE, Rollout, whole_folder
+from sumo_cohesion.experiments.simulation import prepare, simulate
+from sumo_cohesion.experiments.statistics import summarize
+from sumo_cohesion.planning.planners import Planner, make_planner
+from sumo_cohesion.planning.settings import PlannerSettings
+from sumo_cohesion.social.settings import CohesionSettings
+
+COMPARISON_FILE = "comparison.json"
+Progress = Callable[[int, int], None]
+"""Called with (runs done, runs in all)."""
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """One metrics row per run, and rates and means with 95 % intervals per planner."""
+
+    runs: pd.DataFrame
+    summary: pd.DataFrame
+    folder: Path | None
+
+
+@dataclass(frozen=True)
+class _Job:
+    scenario: str
+    planner: str
+    seed: int
+    overrides: tuple[tuple[str, Any], ...]
+    out: Path | None
+
+
+def compare(
+    scenario: str | Path,
+    planners: Sequence[str] = ("nominal", "cohesive"),
+    seeds: Sequence[int] = tuple(range(20)),
+    *,
+    overrides: Mapping[str, Any] | None = None,
+    workers: int | None = None,
+    out: str | Path | None = None,
+    progress: Progress | None = None,
+) -> Comparison:
+    """Run every planner on every seed.
+
+    Parameters
+    ----------
+    scenario, overrides : as for run().
+    planners : names as for run().
+    seeds : each gives all planners the same traffic.
+    workers : processes; one simulation runs in each. Default: one per processor.
+    out : folder for all runs, their metrics, the summary and a picture. It must not exist, be
+        empty, or hold an earlier comparison, which is replaced when all runs are done.
+    progress : called after each run.
+
+    Raises
+    ------
+    UserError
+        If the input is wrong; nothing has been run then.
+    SimulationError
+        If a run or its process failed; finished runs are kept in a folder that is named.
+    """
+    if not planners or not seeds:
+        raise UserError("nothing to compare: give at least one planner and one seed")
+    for name, values in (("planner", planners), ("seed", seeds)):
+        repeated = [v for v in values if list(values).count(v) > 1]
+        if repeated:
+            raise UserError(f"{name} {repeated[0]} is listed twice")
+    for planner in planners:
+        for seed in (min(seeds), max(seeds)):
+            prepare(scenario, planner, seed, overrides)
+    folder = Path(out) if out is not None else None
+    settings = tuple(sorted((overrides or {}).items()))
+    if folder is None:
+        jobs = [_Job(str(scenario), p, s, settings, None) for p in planners for s in seeds]
+        return _compared(_run_all(jobs, workers, progress), planners, None)
+    if folder.exists() and not _replaceable(folder):
+        raise UserError(f"{folder}: not empty and not a comparison; choose another --out")
+    with whole_folder(folder) as new:
+        jobs = [
+            _Job(str(scenario), p, s, settings, run_folder(new, p, s))
+            for p in planners
+            for s in seeds
+        ]
+        try:
+            rows = _run_all(jobs, workers, progress)
+        except (SimulationError, KeyboardInterrupt) as error:
+            kept = _keep(new, folder)
+            if isinstance(error, KeyboardInterrupt) or kept is None:
+                raise
+            raise SimulationError(f"{error}; finished runs are kept in {kept}") from None
+        comparison = _compared(rows, planners, folder)
+        comparison.runs.to_parquet(new / "metrics.parquet", index=False)
+        comparison.summary.to_parquet(new / "summary.parquet", index=False)
+        about = {
+            "scenario": str(scenario),
+            "planners": list(planners),
+            "seeds": list(seeds),
+            "overrides": dict(settings),
+        }
+        (new / COMPARISON_FILE).write_text(json.dumps(about, indent=2) + "\n", encoding="utf-8")
+    return comparison
+
+
+def run_folder(folder: Path, planner: str, seed: int) -> Path:
+    """Folder of one run within a comparison's folder."""
+    return folder / planner.replace(":", ".") / f"seed_{seed:04d}"
+
+
+def load_metrics(folder: str | Path) -> pd.DataFrame:
+    """Metrics rows of a run's folder, or of all runs below a folder.
+
+    Raises
+    ------
+    UserError
+        If there are none.
+    """
+    root = Path(folder)
+    if (root / "metrics.parquet").is_file():
+        return _read(root / "metrics.parquet")
+    parts = sorted(p.parent / "metrics.parquet" for p in root.rglob(RUN_FILE))
+    if not parts:
+        raise UserError(f"{root}: no runs there; give a folder written by run or compare --out")
+    return pd.concat([_read(p) for p in parts], ignore_index=True)
+
+
+def _read(path: Path) -> pd.DataFrame:
+    try:
+        return pd.read_parquet(path)
+    except (OSError, ValueError) as error:
+        raise UserError(f"{path}: not a readable table ({error}); run it again") from None
+
+
+def _replaceable(folder: Path) -> bool:
+    return folder.is_dir() and (
+        (folder / COMPARISON_FILE).is_file() or not any(folder.iterdir())
+    )
+
+
+def _keep(new: Path, folder: Path) -> Path | None:
+    """Move the finished runs of a comparison that broke off beside its folder."""
+    if not any(new.rglob(RUN_FILE)):
+        return None
+    kept = folder.with_name(folder.name + ".unfinished")
+    shutil.rmtree(kept, ignore_errors=True)
+    shutil.copytree(new, kept)
+    return kept
+
+
+def _compared(
+    rows: list[pd.DataFrame], planners: Sequence[str], folder: Path | None
+) -> Comparison:
+    runs = pd.concat(rows, ignore_index=True)
+    return Comparison(runs, summarize(runs), folder)
+
+
+def _run_all(
+    jobs: Sequence[_Job], workers: int | None, progress: Progress | None
+) -> list[pd.DataFrame]:
+    """Run all jobs; results in the order of the jobs, whatever the number of workers."""
+    count = min(workers or os.process_cpu_count() if hasattr(os, "process_cpu_count") else workers or os.cpu_count() or 1, len(jobs))
+    done: dict[int, pd.DataFrame] = {}
+    for i, row in _results(jobs, count):
+        done[i] = row
+        if progress is not None:
+            progress(len(done), len(jobs))
+    return [done[i] for i in range(len(jobs))]
+
+
+def _results(jobs: Sequence[_Job], workers: int) -> Iterator[tuple[int, pd.DataFrame]]:
+    # The workers' linear algebra must not start threads of its own: they would fight for cores.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(workers, mp_context=context) as pool:
+        waiting = {pool.submit(_run_job, job): i for i, job in enumerate(jobs)}
+        try:
+            while waiting:
+                finished, _ = wait(waiting, return_when=FIRST_COMPLETED)
+                for future in finished:
+                    yield waiting.pop(future), future.result()
+        except BrokenProcessPool:
+            raise SimulationError(
+                "a worker process died (killed, out of memory, or SUMO crashed); "
+                "run the seeds one by one to find which"
+            ) from None
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)
+
+
+def _run_job(job: _Job) -> pd.DataFrame:
+    setup = prepare(job.scenario, job.planner, job.seed, dict(job.overrides))
+    planner = _planner(job.planner, setup.settings, setup.cohesion)
+    rollout: Rollout = simulate(setup, planner)
+    if job.out is not None:
+        rollout.write(job.out)
+    return rollout.metrics
+
+
+@lru_cache(maxsize=8)
+def _planner(name: str, settings: PlannerSettings, cohesion: CohesionSettings) -> Planner:
+    """One planner per worker, so that its solver is built once for all seeds."""
+    return make_planner(name, settings, cohesion)

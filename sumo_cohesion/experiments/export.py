@@ -1,0 +1,41 @@
+"""Write a scenario so that plain SUMO opens it."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from sumo_cohesion.errors import UserError
+from sumo_cohesion.experiments.rollout import whole_folder
+from sumo_cohesion.experiments.simulation import prepare
+
+CONFIG_FILE = "scenario.sumocfg"
+
+
+def export_scenario(
+    scenario: str | Path,
+    folder: str | Path,
+    *,
+    seed: int = 0,
+    overrides: Mapping[str, Any] | None = None,
+) -> Path:
+    """Write network, this seed's demand and a .sumocfg; SUMO drives the ego there.
+
+    Returns the path of the .sumocfg: ``sumo -c`` or ``sumo-gui -c`` opens it.
+
+    Raises
+    ------
+    UserError
+        If the scenario is wrong or the folder holds something else.
+    """
+    target = Path(folder)
+    if target.exists() and not (target / CONFIG_FILE).is_file() and any(target.iterdir()):
+        raise UserError(f"{target}: not empty and not an exported scenario; choose another --out")
+    setup = prepare(scenario, "sumo", seed, overrides)
+    with whole_folder(target) as new:
+        setup.write_inputs(new).write_config(new / CONFIG_FILE)
+        for path in (setup.network, *setup.additional):
+            shutil.copyfile(path, new / path.name)
+    return target / CONFIG_FILE
