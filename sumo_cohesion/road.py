@@ -53,6 +53,8 @@ class Road:
     _tree: cKDTree = field(init=False, repr=False, compare=False)
     _segments: list[tuple[float, ...]] = field(init=False, repr=False, compare=False)
     _near: dict[tuple[int, int], int] = field(init=False, repr=False, compare=False)
+    _centre_or_far: FloatArray = field(init=False, repr=False, compare=False)
+    _lane_rows: list[list[float]] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         vertices = np.column_stack((self.x, self.y))
@@ -64,6 +66,10 @@ class Road:
         object.__setattr__(self, "_tree", cKDTree(vertices))
         object.__setattr__(self, "_segments", [tuple(row) for row in segments.tolist()])
         object.__setattr__(self, "_near", {})
+        # No lane is infinitely far: NaN would win every argmin.
+        centre = np.where(np.isnan(self.lane_centre), np.inf, self.lane_centre)
+        object.__setattr__(self, "_centre_or_far", centre)
+        object.__setattr__(self, "_lane_rows", centre.tolist())
 
     def index(self, s: ArrayLike) -> IntArray:
         """Vertex nearest to each arc length s (m)."""
@@ -84,9 +90,17 @@ class Road:
 
     def lane_index(self, s: ArrayLike, d: ArrayLike) -> IntArray:
         """Column of the lane whose centre is nearest to (s, d)."""
-        distance = np.abs(self.lanes_at(s) - np.asarray(d, float)[..., None])
-        distance[np.isnan(distance)] = np.inf
+        distance = np.abs(self._centre_or_far[self.index(s)] - np.asarray(d, float)[..., None])
         return np.asarray(distance.argmin(axis=-1))
+
+    def lane_of(self, s: float, d: float) -> int:
+        """Return lane_index of one point: scalar arithmetic, faster than arrays."""
+        lanes = self._lane_rows[min(max(round((s - self.s0) / SPACING), 0), self.x.size - 1)]
+        nearest, best = 0, float("inf")
+        for lane, centre in enumerate(lanes):
+            if abs(centre - d) < best:
+                nearest, best = lane, abs(centre - d)
+        return nearest
 
     def drivable_at(self, s: ArrayLike, d: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Right and left border (m) of the paved strip that holds, or is nearest to, (s, d).

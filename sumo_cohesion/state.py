@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.intp]
 
 
@@ -95,7 +94,7 @@ class Observation:
     states : (n, 4), columns s, d (m), heading (rad, relative to the road), speed (m/s).
     sizes : (n, 2), columns length, width (m).
     curvature : (n,), curvature (1/m) of the reference line beside each vehicle.
-    voter : (n,), False for vehicles that the scenario marks as special (an ambulance):
+    voter : n flags, False for vehicles that the scenario marks as special (an ambulance):
         they are obstacles, but nobody to follow.
     """
 
@@ -106,14 +105,13 @@ class Observation:
     states: FloatArray
     sizes: FloatArray
     curvature: FloatArray
-    voter: BoolArray
+    voter: tuple[bool, ...]
 
     def __post_init__(self) -> None:
         _require_finite("Observation.states", self.states, (len(self.ids), 4))
 
 
-@dataclass(frozen=True, slots=True)
-class AgreementRow:
+class AgreementRow(NamedTuple):
     """One social feature of one group: what its cars agree on, and how strongly it pulled.
 
     ``mean`` and ``variance`` are of the normalised feature; ``weight`` is 1/variance with the

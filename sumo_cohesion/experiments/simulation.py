@@ -20,6 +20,7 @@ from sumo_cohesion.planning import dynamics
 from sumo_cohesion.planning.planners import Planner, fallback, make_planner
 from sumo_cohesion.planning.settings import PlannerSettings
 from sumo_cohesion.road import Road
+from sumo_cohesion.social.features import social_features
 from sumo_cohesion.social.settings import CohesionSettings
 from sumo_cohesion.state import CartesianState, Observation, Plan, Scene
 from sumo_cohesion.traffic.contact import contacts
@@ -144,7 +145,8 @@ def simulate(setup: Setup, planner: Planner, *, gui: bool = False) -> Rollout:
     scenario, road = setup.scenario, setup.road
     sensing, size = scenario.sensing, (scenario.ego.length, scenario.ego.width)
     sensor = Sensor(road, sensing.range, set(sensing.hidden), set(sensing.special))
-    history = History(STEP_LENGTH, setup.cohesion.interval, setup.cohesion.memory)
+    memory = setup.cohesion.interval, setup.cohesion.memory
+    history = History(STEP_LENGTH, *memory, describe=social_features)
     recorder = Recorder(setup.road, size)
     planner.reset(road)
     with (

@@ -1,35 +1,96 @@
 """What the ego has seen of others: transitions, in bounded memory.
 
-A ring of the last steps holds every car's state. Its size depends on the memory and on the
-number of cars met within it, never on how long the simulation has run.
+Plain Python numbers: the ego has a handful of cars around it, and for so few, arrays cost
+several times more than loops. Memory and time depend on how many cars were met within the
+memory, never on how long the simulation has run.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from bisect import bisect_left, bisect_right
+from collections import deque
+from collections.abc import Callable, Collection, Sequence
+from math import atan2
 
-import numpy as np
+from sumo_cohesion.state import Observation
 
-from sumo_cohesion.state import BoolArray, FloatArray, IntArray, Observation
+State = tuple[float, float, float, float]
+"""s, d (m), heading (rad, of the displacement), speed (m/s), in the road frame."""
+Features = tuple[float, ...]
+Describe = Callable[[State, State, float, float], Features]
+"""Features of a transition: (before, after, seconds between, road curvature)."""
 
 
-@dataclass(frozen=True, slots=True)
-class Transitions:
-    """Pairs of states (x_t, x_t+1) of other cars, in the road frame.
+class Track:
+    """One car's transitions (x_t, x_t+1), oldest first.
 
     Attributes
     ----------
-    car : (m,) number of the car that made each transition.
-    before, after : (m, 4) s, d (m), heading (rad, of the displacement), speed (m/s).
-    curvature : (m,) of the reference line (1/m).
-    interval : seconds between before and after.
+    voter : False for special vehicles, which nobody follows.
+    state : where the car was seen last.
+    step : when it was seen last, in steps.
+    steps, middle_s, middle_d, features : of each remembered transition: the step it ended in,
+        its middle (m), and its features.
     """
 
-    car: IntArray
-    before: FloatArray
-    after: FloatArray
-    curvature: FloatArray
-    interval: float
+    __slots__ = ("_recent", "features", "middle_d", "middle_s", "state", "step", "steps", "voter")
+
+    def __init__(self, lag: int) -> None:
+        self.voter = True
+        self.step = -2
+        self.state: State = (0.0, 0.0, 0.0, 0.0)
+        self.steps: list[int] = []
+        self.middle_s: list[float] = []
+        self.middle_d: list[float] = []
+        self.features: list[Features] = []
+        self._recent: deque[State] = deque(maxlen=lag + 1)
+
+    def see(
+        self,
+        step: int,
+        state: State,
+        curvature: float,
+        least_move: float,
+        interval: float,
+        describe: Describe,
+    ) -> None:
+        """Add what was seen in this step."""
+        s, d, heading, speed = state
+        if self.step != step - 1:
+            self._recent.clear()  # lost from sight: no transition spans the gap
+        elif self._recent:
+            # Heading of the displacement, as the ego's own; SUMO's angle lags behind it. A car
+            # that is new or stands still keeps the reported heading.
+            before = self._recent[-1]
+            along = (s - before[0]) * (1.0 - curvature * d)
+            if along > least_move:
+                heading = atan2(d - before[1], along)
+        self.step = step
+        self.state = state = (s, d, heading, speed)
+        self._recent.append(state)
+        if len(self._recent) == self._recent.maxlen:
+            start = self._recent[0]
+            self.steps.append(step)
+            self.middle_s.append(0.5 * (start[0] + s))
+            self.middle_d.append(0.5 * (start[1] + d))
+            self.features.append(describe(start, state, interval, curvature))
+
+    def newest(self) -> Features | None:
+        """Features of the transition that ended when the car was seen last."""
+        if self.steps and self.steps[-1] == self.step:
+            return self.features[-1]
+        return None
+
+    def passed(self, s: float, reach: float) -> slice:
+        """Which transitions have their middle within ``reach`` (m) of s; cars do not reverse."""
+        return slice(bisect_left(self.middle_s, s - reach), bisect_right(self.middle_s, s + reach))
+
+    def forget(self, before: int) -> None:
+        """Drop transitions that ended before a step."""
+        old = bisect_left(self.steps, before)
+        if old:
+            for series in (self.steps, self.middle_s, self.middle_d, self.features):
+                del series[:old]
 
 
 class History:
@@ -40,104 +101,58 @@ class History:
     step : seconds between observations.
     interval : seconds that one transition spans (a multiple of step).
     memory : seconds to remember.
+    describe : what to remember of a transition; the runner gives the social features.
     """
 
-    def __init__(self, step: float, interval: float, memory: float) -> None:
-        self.step = step
-        self.interval = interval
+    def __init__(self, step: float, interval: float, memory: float, describe: Describe) -> None:
+        self._step_length = step
         self._lag = max(round(interval / step), 1)
-        self._rows = round(memory / step) + self._lag + 1
+        self._interval = self._lag * step
+        self._memory = round(memory / step)
+        self._describe = describe
         self._now = -1
-        self._slots: dict[str, int] = {}
-        self._last_seen: dict[str, int] = {}
-        self._present = np.zeros(0, dtype=np.intp)
-        self._voter: BoolArray = np.zeros(0, dtype=bool)
-        self._free: list[int] = []
-        self._allocate(8)
-
-    def _allocate(self, width: int) -> None:
-        """Give every row room for ``width`` cars; cells nobody has filled are NaN."""
-        old = self._voter.size
-        self._voter = np.concatenate((self._voter, np.zeros(width - old, dtype=bool)))
-        for name, depth in (("_states", 4), ("_middle", 2), ("_curvature", 1)):
-            fresh = np.full((self._rows, width, depth), np.nan)
-            if old:
-                fresh[:, :old] = getattr(self, name)
-            setattr(self, name, fresh)
-        self._free.extend(range(width - 1, old - 1, -1))
-
-    _states: FloatArray
-    _middle: FloatArray
-    _curvature: FloatArray
+        self._tracks: dict[str, Track] = {}
+        self._in_sight: list[Track] = []
 
     def push(self, observation: Observation) -> None:
         """Remember one observation; call it once per step."""
         self._now += 1
-        row = self._now % self._rows
-        self._states[row] = np.nan
-        self._middle[row] = np.nan
-        # The row just taken was the start of the transitions that end one interval after it.
-        self._middle[(row + self._lag) % self._rows] = np.nan
-        slots = np.array([self._slot(name) for name in observation.ids], dtype=np.intp)
-        self._present = slots
-        if slots.size == 0:
-            return
-        states = observation.states.copy()
-        previous = self._states[(row - 1) % self._rows, slots]
-        # Heading of the displacement, as the ego's own; SUMO's angle lags behind it. A car
-        # that is new or stands still keeps the reported heading.
-        stretch = 1.0 - observation.curvature * states[:, 1]
-        along = (states[:, 0] - previous[:, 0]) * stretch
-        moved = along > 0.1 * self.step
-        heading = np.arctan2(states[:, 1] - previous[:, 1], along)
-        states[:, 2] = np.where(moved, heading, states[:, 2])
-        self._states[row, slots] = states
-        self._curvature[row, slots, 0] = observation.curvature
-        self._voter[slots] = observation.voter
-        before = self._states[(row - self._lag) % self._rows, slots]
-        self._middle[row, slots] = 0.5 * (before[:, :2] + states[:, :2])
+        self._forget()
+        rows: Sequence[State] = observation.states.tolist()
+        in_sight = []
+        for name, state, curvature, voter in zip(
+            observation.ids,
+            rows,
+            observation.curvature.tolist(),
+            observation.voter,
+            strict=True,
+        ):
+            track = self._tracks.get(name)
+            if track is None:
+                track = self._tracks[name] = Track(self._lag)
+            track.voter = voter
+            track.see(
+                self._now,
+                state,
+                curvature,
+                0.1 * self._step_length,
+                self._interval,
+                self._describe,
+            )
+            in_sight.append(track)
+        self._in_sight = in_sight
 
-    def _slot(self, name: str) -> int:
-        slot = self._slots.get(name)
-        if slot is None:
-            if not self._free:
-                self._make_room()
-            slot = self._slots[name] = self._free.pop()
-            self._states[:, slot] = np.nan
-            self._middle[:, slot] = np.nan
-        self._last_seen[name] = self._now
-        return slot
+    def _forget(self) -> None:
+        before = self._now - self._memory
+        for name, track in list(self._tracks.items()):
+            track.forget(before)
+            if not track.steps and track.step < before:
+                del self._tracks[name]
 
-    def _make_room(self) -> None:
-        """Forget cars that no remembered transition is of; if there are none, take more memory."""
-        gone = [name for name, step in self._last_seen.items() if self._now - step > self._rows]
-        for name in gone:
-            del self._last_seen[name]
-            self._free.append(self._slots.pop(name))
-        if not gone:
-            self._allocate(2 * self._voter.size)
+    def in_sight(self) -> Collection[Track]:
+        """Tracks of the cars in the latest observation."""
+        return self._in_sight
 
-    def newest(self) -> Transitions:
-        """Return the latest transition of every voting car in sight."""
-        row = self._now % self._rows
-        known = ~np.isnan(self._middle[row, self._present, 0]) & self._voter[self._present]
-        return self._transitions(np.full(int(known.sum()), row), self._present[known])
-
-    def near(self, s: float, d: float, half_length: float, half_width: float) -> Transitions:
-        """Return all remembered transitions of voting cars whose middle lies in a box.
-
-        The box is centred on (s, d) of the road frame; lengths in metres.
-        """
-        offset = np.abs(self._middle - (s, d))
-        inside = (offset[:, :, 0] <= half_length) & (offset[:, :, 1] <= half_width) & self._voter
-        rows, cars = np.nonzero(inside)
-        return self._transitions(rows, cars)
-
-    def _transitions(self, rows: IntArray, cars: IntArray) -> Transitions:
-        return Transitions(
-            car=cars,
-            before=self._states[(rows - self._lag) % self._rows, cars],
-            after=self._states[rows, cars],
-            curvature=self._curvature[rows, cars, 0],
-            interval=self.interval,
-        )
+    def all(self) -> Collection[Track]:
+        """Tracks of all remembered cars, in sight or not."""
+        return self._tracks.values()

@@ -52,5 +52,5 @@ class Sensor:
             states=table[:, :4],
             sizes=scene.sizes[seen],
             curvature=table[:, 4],
-            voter=np.array([name not in self.special for name in ids], dtype=bool),
+            voter=tuple([name not in self.special for name in ids]),
         )

@@ -19,7 +19,7 @@ from sumo_cohesion.errors import UserError
 from sumo_cohesion.perception.history import History
 from sumo_cohesion.planning.settings import PlannerSettings
 from sumo_cohesion.road import Road
-from sumo_cohesion.social.agreement import Agreement, agreement, combine, elect_lateral
+from sumo_cohesion.social.agreement import Agreement, agree, combine, elect_lateral
 from sumo_cohesion.social.features import FEATURES, social_features
 from sumo_cohesion.social.groups import group_votes
 from sumo_cohesion.social.settings import PAPER, CohesionSettings
@@ -81,7 +81,7 @@ class CohesivePlanner:
         # 1. Who and what: the groups' social features (section III-D and III-B).
         # 2. When: their agreement, by sample variance (section III-C).
         start = perf_counter()
-        groups = self._agreements(observation, history) if self.cohesion.beta > 0.0 else ()
+        groups = self._agreement(observation, history) if self.cohesion.beta > 0.0 else ()
         social_time = perf_counter() - start
         # 3. How: trade the ego's reward against cohesion (eq. 2) by MPC (section II-A).
         assert self._mpc is not None, "call reset(road) before plan()"
@@ -90,9 +90,9 @@ class CohesivePlanner:
         plan = self._to_plan(observation, solution, groups)
         return replace(plan, social_time=social_time)
 
-    def _agreements(self, observation: Observation, history: History) -> tuple[Agreement, ...]:
+    def _agreement(self, observation: Observation, history: History) -> tuple[Agreement, ...]:
         votes = group_votes(observation.ego, history, self._road, self.cohesion)
-        groups = tuple(agreement(v, self.cohesion) for v in votes)
+        groups = agree(votes, self.cohesion)
         if self.cohesion.lateral_votes == "most_surprising":
             groups = elect_lateral(groups)
         return groups
@@ -112,7 +112,7 @@ class CohesivePlanner:
         if groups:
             # The paper's cohesion is on the first transition.
             term = combine(groups)
-            weight[:, 0] = self.cohesion.beta * term.weight
+            weight[:, 0] = self.cohesion.beta * np.array(term.weight)
             target[:, 0] = term.target
         return Problem(
             ego=np.array(ego),
@@ -190,13 +190,13 @@ def explain(
         heading,
         speed,
     )
-    own = [float(f) for f in social_features(observation.ego, on, dt, curvature)]
+    own = social_features(observation.ego, on, dt, curvature)
     return tuple(
-        AgreementRow(g.group, name, g.n, m, v, w, o, beta * w * (m - o) ** 2)
-        for g in groups
-        for name, m, v, w, o in zip(
-            FEATURES, g.mean.tolist(), g.variance.tolist(), g.weight.tolist(), own, strict=True
-        )
+        [
+            AgreementRow(g.group, name, g.n, m, v, w, float(o), float(beta * w * (m - o) ** 2))
+            for g in groups
+            for name, m, v, w, o in zip(FEATURES, g.mean, g.variance, g.weight, own, strict=True)
+        ]
     )
 
 

@@ -1,56 +1,62 @@
-"""When: how much a group agrees, and the cohesion term that follows (paper, eq. 2)."""
+"""When: how much each group agrees, and the cohesion term that follows (paper, eq. 2)."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
-import numpy as np
-
-from sumo_cohesion.social.features import LATERAL
+from sumo_cohesion.perception.history import Features
+from sumo_cohesion.social.features import FEATURES, LATERAL
 from sumo_cohesion.social.groups import Votes
 from sumo_cohesion.social.settings import CohesionSettings
-from sumo_cohesion.state import FloatArray
 
-_LATERAL = np.array(LATERAL)
+_ZEROS: Features = (0.0,) * len(FEATURES)
 
 
-@dataclass(frozen=True, slots=True)
-class Agreement:
-    """What one group agrees on: n cars, and (k,) mean, variance and weight per feature.
+class Agreement(NamedTuple):
+    """What one group agrees on, per normalised social feature.
 
-    A group of too few cars has weight zero everywhere, and mean and variance zero.
+    ``weight`` is 1 / (variance + floor). A group of too few cars has zeros everywhere: it has
+    no say.
     """
 
     group: str
     n: int
-    mean: FloatArray
-    variance: FloatArray
-    weight: FloatArray
+    mean: Features
+    variance: Features
+    weight: Features
 
 
-@dataclass(frozen=True, slots=True)
-class CohesionTerm:
+class CohesionTerm(NamedTuple):
     """The sum over groups of weight · (mean − psi)², per feature.
 
     A sum of squares about several means is one square about their weighted mean, plus a
-    constant that no plan can change; so (k,) ``weight`` and ``target`` say it all.
+    constant that no plan can change; so one ``weight`` and one ``target`` per feature say it all.
     """
 
-    weight: FloatArray
-    target: FloatArray
+    weight: Features
+    target: Features
 
 
-def agreement(votes: Votes, settings: CohesionSettings) -> Agreement:
-    """Mean and unbiased variance of a group's votes; weight = 1 / (variance + floor)."""
-    n, k = votes.values.shape
+def agree(votes: Votes, settings: CohesionSettings) -> tuple[Agreement, ...]:
+    """Sample mean, unbiased sample variance and weight of every group's votes."""
+    return tuple([_agree(group, cast, settings) for group, cast in votes.items()])
+
+
+def _agree(group: str, votes: Sequence[Features], settings: CohesionSettings) -> Agreement:
+    n = len(votes)
     if n < settings.min_cars:
-        zero = np.zeros(k)
-        return Agreement(votes.group, n, zero, zero, zero)
-    mean = votes.values.sum(axis=0) / n
-    deviation = votes.values - mean
-    variance = (deviation * deviation).sum(axis=0) / (n - 1)
-    return Agreement(votes.group, n, mean, variance, 1.0 / (variance + settings.variance_floor))
+        return Agreement(group, n, _ZEROS, _ZEROS, _ZEROS)
+    columns = list(zip(*votes, strict=True))
+    mean = tuple([sum(column) / n for column in columns])
+    variance = tuple(
+        [
+            sum([(value - m) * (value - m) for value in column]) / (n - 1)
+            for column, m in zip(columns, mean, strict=True)
+        ]
+    )
+    weight = tuple([1.0 / (v + settings.variance_floor) for v in variance])
+    return Agreement(group, n, mean, variance, weight)
 
 
 def elect_lateral(groups: Sequence[Agreement]) -> tuple[Agreement, ...]:
@@ -62,21 +68,39 @@ def elect_lateral(groups: Sequence[Agreement]) -> tuple[Agreement, ...]:
     largest sum of weight · mean², is the one that has something to say ("for only the subset
     of cars that exhibits the low variance", paper, section I).
     """
-    surprise = [float((g.weight * g.mean * g.mean)[_LATERAL].sum()) for g in groups]
-    chosen = int(np.argmax(surprise))
-    if surprise[chosen] <= 1.0:
+    surprise = [
+        sum(
+            w * m * m
+            for w, m, lateral in zip(g.weight, g.mean, LATERAL, strict=True)
+            if lateral
+        )
+        for g in groups
+    ]
+    most = max(surprise)
+    if most <= 1.0:
         return tuple(groups)
+    chosen = surprise.index(most)
     return tuple(
-        g
-        if i == chosen
-        else Agreement(g.group, g.n, g.mean, g.variance, np.where(_LATERAL, 0.0, g.weight))
-        for i, g in enumerate(groups)
+        [
+            g
+            if i == chosen
+            else g._replace(
+                weight=tuple(
+                    [0.0 if lat else w for w, lat in zip(g.weight, LATERAL, strict=True)]
+                )
+            )
+            for i, g in enumerate(groups)
+        ]
     )
 
 
 def combine(groups: Sequence[Agreement]) -> CohesionTerm:
     """Sum the groups' terms into one weight and one target per feature."""
-    weights = np.array([g.weight for g in groups])
-    total = weights.sum(axis=0)
-    pulled = (weights * np.array([g.mean for g in groups])).sum(axis=0)
-    return CohesionTerm(total, pulled / np.maximum(total, 1e-12))
+    weights = list(zip(*[g.weight for g in groups], strict=True))
+    means = list(zip(*[g.mean for g in groups], strict=True))
+    total = [sum(w) for w in weights]
+    target = [
+        sum([wi * mi for wi, mi in zip(w, m, strict=True)]) / t if t > 0.0 else 0.0
+        for w, m, t in zip(weights, means, total, strict=True)
+    ]
+    return CohesionTerm(tuple(total), tuple(target))

@@ -1,14 +1,12 @@
 """What: the social features psi of a transition (paper, section III-B and figure 3).
 
-The functions run on floats, NumPy arrays and CasADi symbols alike, so that what is measured of
+The function runs on floats, NumPy arrays and CasADi symbols alike, so that what is measured of
 the humans and what the planner makes the ego match is one definition.
 """
 
 from __future__ import annotations
 
 from typing import Any
-
-import numpy as np
 
 FEATURES = ("lateral", "longitudinal", "heading", "distance", "direction")
 """Change of lateral and longitudinal position, of heading, length and direction of the move."""
@@ -47,7 +45,7 @@ def social_features(before: Any, after: Any, interval: Any, curvature: Any = 0.0
     """
     across = after[1] - before[1]
     along = (after[0] - before[0]) * (1.0 - curvature * 0.5 * (before[1] + after[1]))
-    distance = np.sqrt(across * across + along * along + _STANDSTILL**2)
+    distance = (across * across + along * along + _STANDSTILL**2) ** 0.5
     turn = after[2] - before[2]
     lateral, longitudinal, heading, length, direction = SCALES
     return (

@@ -1,71 +1,60 @@
 """Who: the groups whose agreement counts (paper, sections III-D and IV-A).
 
-Each group gives every car one vote: the mean of the transitions it contributes.
+Every car has one vote in a group: the mean of the transitions it contributes.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from math import pi
 
-import numpy as np
-
-from sumo_cohesion.perception.history import History, Transitions
+from sumo_cohesion.perception.history import Features, History, Track
 from sumo_cohesion.road import Road
-from sumo_cohesion.social.features import FEATURES, social_features
 from sumo_cohesion.social.settings import CohesionSettings
-from sumo_cohesion.state import FloatArray, RoadState
+from sumo_cohesion.state import RoadState
 
 GROUPS = ("position", "lane", "road")
 
-
-@dataclass(frozen=True, slots=True)
-class Votes:
-    """The votes of one group: (n, k) normalised social features, one row per car."""
-
-    group: str
-    values: FloatArray
+Votes = dict[str, list[Features]]
+"""By group: the normalised social features that each of its cars votes for."""
 
 
 def group_votes(
     ego: RoadState, history: History, road: Road, settings: CohesionSettings
-) -> tuple[Votes, ...]:
-    """Collect the votes of the position, lane and road groups, in this order.
+) -> Votes:
+    """Collect the votes of the three groups.
 
     - position: transitions that any car made, at any remembered time, where the ego is now;
     - lane: cars that are in the ego's lane now;
     - road: cars that are near the ego on the road now.
     """
-    past = history.near(ego.s, ego.d, settings.position_length, settings.position_width)
-    now = history.newest()
-    values = _features(now)
-    ahead = now.after[:, 0] - ego.s
-    along = np.abs(now.after[:, 2]) < np.pi / 2  # oncoming traffic is nobody to follow
-    reach = np.abs(ahead)
-    on_road = along & (reach <= settings.road_reach)
-    in_lane = (
-        along
-        & (ahead <= settings.lane_ahead)
-        & (ahead >= -settings.lane_behind)
-        & (road.lane_index(now.after[:, 0], now.after[:, 1]) == road.lane_index(ego.s, ego.d))
-    )
-    return (
-        Votes("position", _mean_per_car(past.car, _features(past))),
-        Votes("lane", values[in_lane]),
-        Votes("road", values[on_road]),
-    )
+    votes: Votes = {group: [] for group in GROUPS}
+    for track in history.all():
+        if track.voter and (vote := _vote_at_place(track, ego, settings)):
+            votes["position"].append(vote)
+    own_lane = road.lane_of(ego.s, ego.d)
+    for track in history.in_sight():
+        vote = track.newest() if track.voter else None
+        s, d, heading, _ = track.state
+        if vote is None or abs(heading) > pi / 2:
+            continue  # oncoming traffic is nobody to follow
+        ahead = s - ego.s
+        if abs(ahead) <= settings.road_reach:
+            votes["road"].append(vote)
+        within = -settings.lane_behind <= ahead <= settings.lane_ahead
+        if within and road.lane_of(s, d) == own_lane:
+            votes["lane"].append(vote)
+    return votes
 
 
-def _features(transitions: Transitions) -> FloatArray:
-    """Return (m, k) social features of m transitions."""
-    columns = social_features(
-        transitions.before.T, transitions.after.T, transitions.interval, transitions.curvature
-    )
-    return np.array(columns).T
-
-
-def _mean_per_car(car: FloatArray, values: FloatArray) -> FloatArray:
-    """Average (m, k) rows that belong to the same car: (n, k)."""
-    cars, member = np.unique(car, return_inverse=True)
-    share = (member[:, None] == np.arange(cars.size)).astype(float)
-    share /= share.sum(axis=0)
-    return share.T @ values
+def _vote_at_place(track: Track, ego: RoadState, settings: CohesionSettings) -> Features | None:
+    """Mean features of one car's transitions around the ego's place; None if it kept aside."""
+    passed = track.passed(ego.s, settings.position_length)
+    samples = [
+        features
+        for features, d in zip(track.features[passed], track.middle_d[passed], strict=True)
+        if abs(d - ego.d) <= settings.position_width
+    ]
+    if not samples:
+        return None
+    n = len(samples)
+    return tuple([sum(column) / n for column in zip(*samples, strict=True)])

@@ -1,0 +1,125 @@
+"""Cost of the ego's own rooms beside SUMO's step, in one run, with the same traffic.
+
+    python benchmarks/rooms.py
+
+Perception and social together should cost no more than one SUMO step, and their share must not
+grow with simulated time. The first table is `stalled`; the second drives ten minutes through a
+stream of traffic and compares its first minute with its last.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from sumo_cohesion.experiments.rollout import versions
+from sumo_cohesion.experiments.simulation import prepare, simulate
+from sumo_cohesion.planning.planners import make_planner
+from sumo_cohesion.traffic.simulator import Simulator
+
+SCENARIO = """
+name = "stream"
+summary = "Ten minutes in a stream of traffic on a long highway."
+network = "long.net.xml"
+routes = ["stream.rou.xml"]
+duration = {duration}
+[ego]
+origin = "e0"
+destination = "e{last}"
+lane = 1
+position = 100.0
+speed = 25.0
+depart = 30.0
+[success]
+collision = false
+"""
+
+
+def timed_rollout(scenario: str | Path, seed: int, overrides: dict[str, Any]) -> pd.DataFrame:
+    """Timing table of one cohesive run, with SUMO's bare step (moveToXY and step) added."""
+    steps: list[float] = []
+    original = Simulator.step
+
+    def step(self: Simulator, ego: Any) -> None:
+        start = perf_counter()
+        original(self, ego)
+        steps.append(1e3 * (perf_counter() - start))
+
+    Simulator.step = step  # type: ignore[method-assign]
+    try:
+        setup = prepare(scenario, "cohesive", seed, overrides)
+        rollout = simulate(setup, make_planner("cohesive", setup.settings, setup.cohesion))
+    finally:
+        Simulator.step = original  # type: ignore[method-assign]
+    return rollout.timing.assign(step_ms=steps[: len(rollout.timing)])
+
+
+def write_long_highway(folder: Path, minutes: float) -> Path:
+    """Write a straight highway in 1 km edges, long enough for the drive, with a stream on it."""
+    import subprocess
+
+    n = int(minutes * 60 * 30 / 1000) + 3
+    nodes = "".join(f'<node id="n{i}" x="{1000 * i}" y="0"/>' for i in range(n + 1))
+    edges = "".join(
+        f'<edge id="e{i}" from="n{i}" to="n{i + 1}" numLanes="3" width="3.5" speed="25"/>'
+        for i in range(n)
+    )
+    (folder / "long.nod.xml").write_text(f"<nodes>{nodes}</nodes>")
+    (folder / "long.edg.xml").write_text(f"<edges>{edges}</edges>")
+    subprocess.run(
+        ["netconvert", "-n", "long.nod.xml", "-e", "long.edg.xml", "-o", "long.net.xml"]
+        + ["--offset.disable-normalization", "true", "--no-turnarounds", "true"],
+        cwd=folder,
+        check=True,
+        capture_output=True,
+    )
+    route = " ".join(f"e{i}" for i in range(n))
+    flows = "".join(
+        f'<flow id="f{lane}" type="human" route="all" begin="0" end="40" period="2.5" '
+        f'departLane="{lane}" departSpeed="desired"/>'
+        for lane in range(3)
+    )
+    (folder / "stream.rou.xml").write_text(
+        '<routes><vType id="human" laneChangeModel="SL2015" speedDev="0.02"/>'
+        f'<route id="all" edges="{route}"/>{flows}</routes>'
+    )
+    path = folder / "stream.toml"
+    path.write_text(SCENARIO.format(duration=60 * minutes, last=n - 1))
+    return path
+
+
+def report(name: str, table: pd.DataFrame) -> float:
+    """Print medians of one stretch; returns the share own rooms / SUMO's step."""
+    own = table["perception_ms"] + table["social_ms"]
+    share = float(own.median() / table["step_ms"].median())
+    print(
+        f"{name:34} perception {1e3 * table['perception_ms'].median():7.0f}  "
+        f"social {1e3 * table['social_ms'].median():7.0f}  "
+        f"SUMO step {1e3 * table['step_ms'].median():7.0f} µs   ratio {share:.2f}"
+    )
+    return share
+
+
+def main() -> None:
+    print("versions:", versions())
+    shares = []
+    for seed in range(5):
+        table = timed_rollout("stalled", seed, {})
+        shares.append(report(f"stalled, seed {seed}", table))
+    print(f"stalled: median ratio of 5 seeds {np.median(shares):.2f}")
+    with tempfile.TemporaryDirectory() as folder:
+        path = write_long_highway(Path(folder), minutes=10.5)
+        table = timed_rollout(path, 0, {"duration": 600.0})
+    first, last = table.iloc[:600], table.iloc[-600:]
+    a = report("stream, first 60 s of 600 s", first)
+    b = report("stream, last 60 s of 600 s", last)
+    print(f"growth of the ratio from the first to the last minute: {b / a:.2f}")
+
+
+if __name__ == "__main__":
+    main()
