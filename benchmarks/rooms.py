@@ -41,7 +41,7 @@ collision = false
 
 
 def timed_rollout(scenario: str | Path, seed: int, overrides: dict[str, Any]) -> pd.DataFrame:
-    """Timing table of one cohesive run, with SUMO's bare step (moveToXY and step) added."""
+    """Return one cohesive run's timing table, with SUMO's bare step (moveToXY and step) added."""
     steps: list[float] = []
     original = Simulator.step
 
@@ -72,8 +72,19 @@ def write_long_highway(folder: Path, minutes: float) -> Path:
     (folder / "long.nod.xml").write_text(f"<nodes>{nodes}</nodes>")
     (folder / "long.edg.xml").write_text(f"<edges>{edges}</edges>")
     subprocess.run(
-        ["netconvert", "-n", "long.nod.xml", "-e", "long.edg.xml", "-o", "long.net.xml"]
-        + ["--offset.disable-normalization", "true", "--no-turnarounds", "true"],
+        [
+            "netconvert",
+            "-n",
+            "long.nod.xml",
+            "-e",
+            "long.edg.xml",
+            "-o",
+            "long.net.xml",
+            "--offset.disable-normalization",
+            "true",
+            "--no-turnarounds",
+            "true",
+        ],
         cwd=folder,
         check=True,
         capture_output=True,

@@ -243,12 +243,12 @@ def _print_summary(summary: pd.DataFrame) -> None:
     table = Table(title="95 % confidence intervals: Wilson for rates, bootstrap for means")
     for name in ("metric", *summary["planner"].unique()):
         table.add_column(name, justify="left" if name == "metric" else "right", no_wrap=True)
-    for metric, rows in summary.groupby("metric", sort=False):
+    for metric in summary["metric"].unique():
         cells = [
             f"{r.value:.2f} [{r.low:.2f}, {r.high:.2f}] n={r.n}" if r.n else "-"
-            for r in rows.itertuples()
+            for r in summary[summary["metric"] == metric].itertuples()
         ]
-        table.add_row(str(metric), *cells)
+        table.add_row(metric, *cells)
     # Wide enough for the table where the output is a file or a pipe.
     Console(width=None if sys.stdout.isatty() else 140).print(table)
 
@@ -257,8 +257,14 @@ def _print_summary(summary: pd.DataFrame) -> None:
 def _progress(title: str) -> Iterator[Any]:
     """Show a bar with rate and ETA on a terminal, nothing elsewhere; on standard error."""
     from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
-    from rich.progress import TimeElapsedColumn, TimeRemainingColumn
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
 
     columns = (
         TextColumn("{task.description}"),

@@ -38,7 +38,9 @@ PLAN = (
     Column("fallback", "bool", "", "the ego braked in lane because there was no usable plan"),
     Column("iterations", "int64", "", "solver iterations"),
     Column("curvature", "float64", "1/m", "driven control; NaN if SUMO drives"),
-    Column("acceleration", "float64", "m/s²", "driven control, before friction; NaN if SUMO drives"),
+    Column(
+        "acceleration", "float64", "m/s²", "driven control, before friction; NaN if SUMO drives"
+    ),
     Column("road_right", "float64", "m", "d of the drivable strip's right edge at the ego"),
     Column("road_left", "float64", "m", "d of the drivable strip's left edge at the ego"),
     Column("on_exit", "bool", "", "the ego's nearest lane is not one of its route"),

@@ -89,7 +89,7 @@ def compare(
     settings = tuple(sorted((overrides or {}).items()))
     if folder is None:
         jobs = [_Job(str(scenario), p, s, settings, None) for p in planners for s in seeds]
-        return _compared(_run_all(jobs, workers, progress), planners, None)
+        return _compared(_run_all(jobs, workers, progress), None)
     if folder.exists() and not _replaceable(folder):
         raise UserError(f"{folder}: not empty and not a comparison; choose another --out")
     with whole_folder(folder) as new:
@@ -105,7 +105,7 @@ def compare(
             if isinstance(error, KeyboardInterrupt) or kept is None:
                 raise
             raise SimulationError(f"{error}; finished runs are kept in {kept}") from None
-        comparison = _compared(rows, planners, folder)
+        comparison = _compared(rows, folder)
         comparison.runs.to_parquet(new / "metrics.parquet", index=False)
         comparison.summary.to_parquet(new / "summary.parquet", index=False)
         about = {
@@ -148,9 +148,7 @@ def _read(path: Path) -> pd.DataFrame:
 
 
 def _replaceable(folder: Path) -> bool:
-    return folder.is_dir() and (
-        (folder / COMPARISON_FILE).is_file() or not any(folder.iterdir())
-    )
+    return folder.is_dir() and ((folder / COMPARISON_FILE).is_file() or not any(folder.iterdir()))
 
 
 def _keep(new: Path, folder: Path) -> Path | None:
@@ -163,9 +161,7 @@ def _keep(new: Path, folder: Path) -> Path | None:
     return kept
 
 
-def _compared(
-    rows: list[pd.DataFrame], planners: Sequence[str], folder: Path | None
-) -> Comparison:
+def _compared(rows: list[pd.DataFrame], folder: Path | None) -> Comparison:
     runs = pd.concat(rows, ignore_index=True)
     return Comparison(runs, summarize(runs), folder)
 
@@ -174,7 +170,7 @@ def _run_all(
     jobs: Sequence[_Job], workers: int | None, progress: Progress | None
 ) -> list[pd.DataFrame]:
     """Run all jobs; results in the order of the jobs, whatever the number of workers."""
-    count = min(workers or os.process_cpu_count() if hasattr(os, "process_cpu_count") else workers or os.cpu_count() or 1, len(jobs))
+    count = min(workers or os.cpu_count() or 1, len(jobs))
     done: dict[int, pd.DataFrame] = {}
     for i, row in _results(jobs, count):
         done[i] = row

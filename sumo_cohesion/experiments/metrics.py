@@ -169,5 +169,5 @@ def human_metrics(others: pd.DataFrame, hidden: list[str]) -> dict[str, float]:
         # A car may leave the range and come back: such a gap is no braking.
         hard = (np.diff(speed) / step < -HARD_BRAKE - 1e-6) & (step < 0.15)
         brakes += int((hard & ~np.concatenate(([False], hard[:-1]))).sum())
-    speed = float(humans["speed"].mean()) if len(humans) else np.nan
-    return {"human_mean_speed": speed, "human_hard_brakes": brakes}
+    mean_speed = float(humans["speed"].mean()) if len(humans) else np.nan
+    return {"human_mean_speed": mean_speed, "human_hard_brakes": brakes}

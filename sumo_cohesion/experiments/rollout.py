@@ -174,7 +174,9 @@ class Recorder:
         times = np.array([scene.time for scene in self._scenes])
         step = np.arange(len(self._scenes))
         names = [name for scene in self._scenes for name in scene.ids]
-        seen = [n in v for scene, v in zip(self._scenes, self._visible, strict=True) for n in scene.ids]
+        seen = [
+            n in v for scene, v in zip(self._scenes, self._visible, strict=True) for n in scene.ids
+        ]
         columns = {
             "time": np.concatenate((times, np.repeat(times, counts))),
             "vehicle": [EGO] * len(egos) + names,

@@ -198,7 +198,8 @@ def validated(model: type[Model], data: object, where: str) -> Model:
     try:
         return model.model_validate(data)
     except ValidationError as error:
-        first = error.errors()[0]
+        # A misspelt key is also a missing one; name the misspelling.
+        first = min(error.errors(), key=lambda e: e["type"] != "extra_forbidden")
         key = ".".join(str(part) for part in first["loc"])
         if first["type"] == "extra_forbidden":
             known = _fields_at(model, first["loc"][:-1])
@@ -216,9 +217,9 @@ def _fields_at(model: type[BaseModel], loc: Sequence[int | str]) -> list[str]:
     """Names of the fields of the sub-model that a validation error's location points to."""
     for part in loc:
         inner = model.model_fields.get(str(part))
-        if inner is not None and isinstance(inner.annotation, type):
-            if issubclass(inner.annotation, BaseModel):
-                model = inner.annotation
+        kind = inner.annotation if inner is not None else None
+        if isinstance(kind, type) and issubclass(kind, BaseModel):
+            model = kind
     return list(model.model_fields)
 
 

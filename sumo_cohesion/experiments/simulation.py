@@ -10,7 +10,6 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
-
 from sumo_cohesion.errors import UserError
 from sumo_cohesion.experiments.rollout import Recorder, Rollout
 from sumo_cohesion.experiments.scenario import Scenario, load_scenario, settings_from

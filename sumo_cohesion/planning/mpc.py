@@ -140,7 +140,11 @@ class Mpc:
             cohesion -= ca.dot(p["cohesion_weight"][:, t], missed**2)
         unknowns.append(states[horizon])
 
-        z, g, parameters = ca.vertcat(*unknowns), ca.vertcat(*constraints), ca.vertcat(*map(ca.vec, p.values()))
+        z, g, parameters = (
+            ca.vertcat(*unknowns),
+            ca.vertcat(*constraints),
+            ca.vertcat(*map(ca.vec, p.values())),
+        )
         objective = -(ca.vertcat(*total.values(), cohesion))
         is_equality = [True] * g.shape[0]
         self._n = z.shape[0]
@@ -224,6 +228,8 @@ class Mpc:
         u_low = np.array([-settings.max_curvature, drag - settings.max_braking]) / _CONTROL_SCALE
         t = settings.horizon
         lower = np.concatenate((np.tile(np.concatenate((x_low, u_low)), t), x_low))
+        # The present state is given: a bound that it lies on would leave no interior.
+        lower[:4] = -np.inf
         upper = np.concatenate((np.tile(np.concatenate((x_high, u_high)), t), x_high))
         return lower, upper
 

@@ -279,5 +279,7 @@ def _load_planner(name: str) -> Planner:
             f"planner {name!r}: the class must be callable without arguments ({error})"
         ) from None
     if not isinstance(planner, Planner):
-        raise UserError(f"planner {name!r} needs the methods reset(road) and plan(observation, history)")
+        raise UserError(
+            f"planner {name!r} needs the methods reset(road) and plan(observation, history)"
+        )
     return planner

@@ -51,8 +51,10 @@ def terms(state: Any, control: Any, inputs: StageInputs, ego_width: Any) -> dict
 
 
 def _lane(d: Any, inputs: StageInputs) -> Any:
-    """One Gaussian per lane. It saturates: far from every lane centre nothing pulls, so that
-    the car may cross a line when it has a reason to.
+    """One Gaussian per lane.
+
+    It saturates: far from every centre nothing pulls, so that the car may cross a line when it
+    has a reason to.
     """
     z = (d - inputs.lanes) / (LANE_SIGMA * inputs.lane_widths)
     return ca.sum1(ca.exp(-0.5 * z**2))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,6 +17,7 @@ from sumo_cohesion.experiments.rollout import Rollout
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from matplotlib.patches import Rectangle
 
 EGO_COLOURS = {"nominal": "tab:blue", "cohesive": "tab:orange", "paper": "tab:green"}
 """The paper draws the nominal robot blue and the cohesive one orange."""
@@ -69,7 +71,9 @@ def _draw(rollouts: list[Rollout]) -> Figure:
     axes[0].set_xlim(*window)
     axes[-1].set_xlabel("along the road, s [m]")
     info = rollouts[0].info
-    figure.suptitle(f"{info['scenario']['name']}, seed {info['seed']}: {info['scenario']['summary']}")
+    figure.suptitle(
+        f"{info['scenario']['name']}, seed {info['seed']}: {info['scenario']['summary']}"
+    )
     return figure
 
 
@@ -86,33 +90,22 @@ def _window(rollouts: list[Rollout]) -> tuple[float, float]:
 
 
 def _draw_paths(axis: Axes, rollout: Rollout, window: tuple[float, float]) -> None:
-    from matplotlib.patches import Rectangle
-
+    """Draw all paths, and all cars at the moment that matters most."""
     table, info = rollout.trajectory, rollout.info
-    inside = table[table["s"].between(*window)]
-    hidden = set(info["hidden"])
-    for name, car in inside.groupby("vehicle", sort=False):
-        if name == "ego" or name in hidden:
-            continue
-        axis.plot(car["s"], car["d"], color="0.6", lw=1.0)
-        last = car.iloc[-1]
-        if last["time"] == table["time"].iloc[-1]:
-            axis.add_patch(_box(Rectangle, last, "white", "0.4"))
-    for name in hidden:
-        car = inside[inside["vehicle"] == name]
-        if len(car):
-            axis.add_patch(_box(Rectangle, car.iloc[-1], "0.7", "0.2"))
-    ego = inside[inside["vehicle"] == "ego"]
     colour = EGO_COLOURS.get(info["planner"], "tab:red")
-    axis.plot(ego["s"], ego["d"], color=colour, lw=2.0)
-    if len(ego):
-        axis.add_patch(_box(Rectangle, ego.iloc[-1], colour, "black"))
-    plan = rollout.plan
-    right, left = plan["road_right"].median(), plan["road_left"].median()
-    for edge in (right, left):
-        axis.axhline(edge, color="black", lw=1.2)
+    inside = table[table["s"].between(*window)]
+    for name, car in inside.groupby("vehicle", sort=False):
+        own = name == "ego"
+        axis.plot(car["s"], car["d"], color=colour if own else "0.6", lw=2.0 if own else 1.0)
+    for _, now in inside[inside["time"] == _moment(rollout)].iterrows():
+        face = "white" if now["visible"] else "0.6"
+        axis.add_patch(_box(now, colour if now["vehicle"] == "ego" else face))
+    ego = table[table["vehicle"] == "ego"].iloc[: len(rollout.plan)]
+    for edge in ("road_right", "road_left"):
+        axis.plot(ego["s"], rollout.plan[edge], color="black", lw=1.2)
+    right, left = rollout.plan["road_right"].min(), rollout.plan["road_left"].max()
     lanes = inside.groupby("lane")["d"].median().sort_index()
-    for a, b in zip(lanes, lanes[1:], strict=False):
+    for a, b in pairwise(lanes):
         axis.axhline((a + b) / 2, color="0.8", lw=0.8, ls="--")
     axis.set_ylim(right - 0.6, left + 0.6)
     end = f"collides with {info['touched'][0]}" if info["touched"] else info["outcome"]
@@ -120,16 +113,28 @@ def _draw_paths(axis: Axes, rollout: Rollout, window: tuple[float, float]) -> No
     axis.set_ylabel("across, d [m]")
 
 
-def _box(rectangle: type, car: pd.Series, face: str, edge: str) -> object:
+def _moment(rollout: Rollout) -> float:
+    """Time of the contact, or when the ego passed a hidden car, or the end."""
+    table = rollout.trajectory
+    hidden = table[table["vehicle"].isin(rollout.info["hidden"])]
+    if rollout.info["touched"] or hidden.empty:
+        return float(table["time"].iloc[-1])
+    pair = hidden.merge(table[table["vehicle"] == "ego"], on="time", suffixes=("", "_ego"))
+    return float(pair["time"].iloc[int((pair["s"] - pair["s_ego"]).abs().argmin())])
+
+
+def _box(car: pd.Series, face: str) -> Rectangle:
+    from matplotlib.patches import Rectangle
+
     corner = (car["s"] - car["length"] / 2, car["d"] - car["width"] / 2)
-    return rectangle(
+    return Rectangle(
         corner,
         car["length"],
         car["width"],
-        angle=np.degrees(car["road_heading"]),
+        angle=float(np.degrees(car["road_heading"])),
         rotation_point="center",
         facecolor=face,
-        edgecolor=edge,
+        edgecolor="black",
         zorder=3,
     )
 

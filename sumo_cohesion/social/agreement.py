@@ -69,11 +69,7 @@ def elect_lateral(groups: Sequence[Agreement]) -> tuple[Agreement, ...]:
     of cars that exhibits the low variance", paper, section I).
     """
     surprise = [
-        sum(
-            w * m * m
-            for w, m, lateral in zip(g.weight, g.mean, LATERAL, strict=True)
-            if lateral
-        )
+        sum(w * m * m for w, m, lateral in zip(g.weight, g.mean, LATERAL, strict=True) if lateral)
         for g in groups
     ]
     most = max(surprise)
@@ -85,9 +81,7 @@ def elect_lateral(groups: Sequence[Agreement]) -> tuple[Agreement, ...]:
             g
             if i == chosen
             else g._replace(
-                weight=tuple(
-                    [0.0 if lat else w for w, lat in zip(g.weight, LATERAL, strict=True)]
-                )
+                weight=tuple([0.0 if lat else w for w, lat in zip(g.weight, LATERAL, strict=True)])
             )
             for i, g in enumerate(groups)
         ]

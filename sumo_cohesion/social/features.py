@@ -25,7 +25,9 @@ _STANDSTILL = 1e-3
 """Metres; a car that does not move has no direction, and this keeps the direction at zero."""
 
 
-def social_features(before: Any, after: Any, interval: Any, curvature: Any = 0.0) -> tuple[Any, ...]:
+def social_features(
+    before: Any, after: Any, interval: Any, curvature: Any = 0.0
+) -> tuple[Any, ...]:
     """Social features psi of the transition from one state to the next, normalised.
 
     Parameters

@@ -18,9 +18,7 @@ Votes = dict[str, list[Features]]
 """By group: the normalised social features that each of its cars votes for."""
 
 
-def group_votes(
-    ego: RoadState, history: History, road: Road, settings: CohesionSettings
-) -> Votes:
+def group_votes(ego: RoadState, history: History, road: Road, settings: CohesionSettings) -> Votes:
     """Collect the votes of the three groups.
 
     - position: transitions that any car made, at any remembered time, where the ego is now;

@@ -44,5 +44,7 @@ class CohesionSettings(BaseModel):
     road_reach: Positive = 60.0
 
 
-PAPER = CohesionSettings(lateral_votes="all", interval=0.1, position_length=3.0, position_width=1.85)
+PAPER = CohesionSettings(
+    lateral_votes="all", interval=0.1, position_length=3.0, position_width=1.85
+)
 """The paper's formula as printed: every group votes on every feature, one-step transitions."""

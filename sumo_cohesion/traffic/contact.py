@@ -52,4 +52,4 @@ def contacts(
         | (np.abs(dx * cos_o + dy * sin_o) >= half_length + ego_length * cos_r + ego_width * sin_r)
         | (np.abs(dy * cos_o - dx * sin_o) >= half_width + ego_length * sin_r + ego_width * cos_r)
     )
-    return near[~apart]
+    return np.asarray(near[~apart])

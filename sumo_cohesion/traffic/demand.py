@@ -51,7 +51,8 @@ class Randomization(BaseModel):
     lead_spacing : [low, high] (m) between the fronts of consecutive cars ahead of the ego in
         its lane, each gap drawn anew; the first gap is the ego's own.
     position : every other vehicle starts up to so many metres before or after its place.
-    speed : every human's desired speed changes by up to this share.
+    speed : every human's desired speed changes by up to this share, on top of the speedDev of
+        its type (SUMO itself would ignore speedDev once a vehicle has a speedFactor).
     humans : [fewest, most] human cars; the first so many of the route files are kept.
     """
 
@@ -131,20 +132,23 @@ def build_demand(
     # Draws are made for every vehicle, kept or not, so that one setting does not shift another's.
     shift = rng.uniform(-1.0, 1.0, len(others)) * randomization.position
     pace = 1.0 + rng.uniform(-1.0, 1.0, len(others)) * randomization.speed
+    temper = rng.standard_normal(len(others))
     spacing = randomization.lead_spacing
     gaps = rng.uniform(*spacing, len(others)) if spacing else np.zeros(len(others))
-    count = rng.integers(randomization.humans[0], randomization.humans[1] + 1) if (
-        randomization.humans
-    ) else len(humans)
+    count = (
+        rng.integers(randomization.humans[0], randomization.humans[1] + 1)
+        if (randomization.humans)
+        else len(humans)
+    )
 
     leads = _leads(humans, ego) if spacing else []
-    for vehicle, metres, factor in zip(others, shift, pace, strict=True):
+    types = {t.get("id"): t for t in merged.iter("vType")}
+    for vehicle, metres, factor, normal in zip(others, shift, pace, temper, strict=True):
         if vehicle not in leads:
             _shift_along(vehicle, float(metres))
-        if vehicle in humans:
-            pace_of = float(vehicle.get("speedFactor", 1.0)) * float(factor)
-            if randomization.speed:
-                vehicle.set("speedFactor", f"{pace_of:.6f}")
+        if vehicle in humans and randomization.speed:
+            own = _speed_factor(vehicle, types, float(normal))
+            vehicle.set("speedFactor", f"{own * float(factor):.6f}")
     for vehicle, position in zip(leads, ego.position + np.cumsum(gaps), strict=False):
         _shift_along(vehicle, float(position) - float(vehicle.get("departPos", 0.0)))
     for vehicle in humans[int(count) :]:
@@ -183,6 +187,23 @@ def _numeric(text: str | None) -> bool:
     except ValueError:
         return False
     return True
+
+
+def _speed_factor(vehicle: ET.Element, types: dict[str | None, ET.Element], normal: float) -> float:
+    """Desired speed over the limit: the vehicle's own, or drawn from its type as SUMO would.
+
+    SUMO draws from a normal distribution cut off at 0.2 and 2 (its defaults for cars).
+    """
+    if _numeric(vehicle.get("speedFactor")):
+        return float(vehicle.get("speedFactor", 1.0))
+    kind = types.get(vehicle.get("type"), ET.Element("vType"))
+    mean, deviation = kind.get("speedFactor", "1.0"), kind.get("speedDev", "0.1")
+    if not (_numeric(mean) and _numeric(deviation)):
+        raise UserError(
+            f"vType {kind.get('id')!r}: speedFactor {mean!r} with speedDev {deviation!r} cannot be "
+            "combined with randomize.speed; give plain numbers"
+        )
+    return min(max(float(mean) + float(deviation) * normal, 0.2), 2.0)
 
 
 def _shift_along(vehicle: ET.Element, metres: float) -> None:

@@ -206,12 +206,12 @@ class Network:
                 free = np.isnan(centre[at, column])
                 centre[at[free], column] = d[free]
                 width[at[free], column] = lane.getWidth()
-                if column < n_route and not lane.getEdge().getFunction() == "internal":
+                if column < n_route and lane.getEdge().getFunction() != "internal":
                     limit[at] = np.fmax(limit[at], lane.getSpeed())
                     if lane.getEdge() == edges[-1]:
                         ends.append(at[-1])
         last = max(ends)
-        first = int(round(-road.s0 / SPACING))
+        first = round(-road.s0 / SPACING)
         for values in (centre[:, :n_route], width[:, :n_route], limit[:, None]):
             values[:first] = values[first]
             values[last:] = values[last]
@@ -258,7 +258,7 @@ def _reference_line(points: FloatArray) -> FloatArray:
     length = _arc_length(points)[-1]
     if length < 3 * SPACING:
         raise UserError("the ego's route is shorter than 3 m; choose another destination")
-    line = _resample(points, int(round(length / SPACING)) + 1)
+    line = _resample(points, round(length / SPACING) + 1)
     head, tail = line[0] - line[1], line[-1] - line[-2]
     steps = np.arange(1.0, EXTENSION / SPACING + 1)[:, None]
     head, tail = (steps * v * SPACING / np.hypot(*v) for v in (head, tail))
@@ -267,7 +267,7 @@ def _reference_line(points: FloatArray) -> FloatArray:
     # The filter needs neighbours on both sides; the straight ends do not need the filter.
     margin = int(EXTENSION / SPACING) // 2
     smooth[:margin], smooth[-margin:] = line[:margin], line[-margin:]
-    return _resample(smooth, int(round(_arc_length(smooth)[-1] / SPACING)) + 1)
+    return _resample(smooth, round(_arc_length(smooth)[-1] / SPACING) + 1)
 
 
 def _bare_road(line: FloatArray) -> Road:

@@ -151,7 +151,11 @@ class Simulator:
                     f"SUMO has not inserted the ego by {latest:g} s; its start is blocked, "
                     "choose another ego.position, ego.lane or ego.depart"
                 )
-            self._step()
+            try:
+                self._step()
+            except SimulationError as error:
+                # What stops SUMO before the ego has departed is in the user's files.
+                raise UserError(f"{error}; mend the demand") from None
         self._sumo.vehicle.subscribeContext(
             EGO, self._sumo.constants.CMD_GET_VEHICLE_VARIABLE, self._radius, self._variables
         )
@@ -185,11 +189,16 @@ class Simulator:
 
     def read(self) -> Scene:
         """Read what is around the ego now."""
-        found = self._sumo.vehicle.getContextSubscriptionResults(EGO)
-        if EGO not in found:
-            raise SimulationError("SUMO has removed the ego; it left its route or its network")
+        vehicle = self._sumo.vehicle
+        found = vehicle.getContextSubscriptionResults(EGO)
         position, angle, speed = self._variables
-        own = found.pop(EGO)
+        if EGO in found:
+            own = found.pop(EGO)
+        elif EGO in vehicle.getIDList():
+            # Beside the road SUMO's search around the ego does not find the ego itself.
+            own = {position: vehicle.getPosition(EGO), angle: vehicle.getAngle(EGO), speed: 0.0}
+        else:
+            raise SimulationError("SUMO has removed the ego; it came to the end of its route")
         ego = self._centre(own[position], own[angle], own[speed], self._ego_size[0])
         if self._driven is not None:
             error = hypot(ego.x - self._driven.x, ego.y - self._driven.y)

@@ -1,0 +1,28 @@
+"""Fixtures shared by all tests."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import pytest
+
+from sumo_cohesion.road import Road
+from sumo_cohesion.traffic.network import Network
+
+ROOT = Path(__file__).resolve().parent.parent
+NETWORKS = ROOT / "tests" / "networks"
+
+
+@pytest.fixture(scope="session")
+def highway() -> Road:
+    network = Network(ROOT / "networks" / "highway.net.xml")
+    return network.road(network.route("west", "east"))
+
+
+@pytest.fixture(scope="session")
+def curve() -> Road:
+    network = Network(NETWORKS / "curve.net.xml")
+    return network.road(network.route("straight", "bend_2"))

@@ -1,0 +1,248 @@
+"""The bridge on real SUMO: the ego is where it was put, contacts are found, runs repeat."""
+
+from __future__ import annotations
+
+import math
+import subprocess
+import sys
+import xml.etree.ElementTree as ET
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sumo_cohesion.errors import SimulationError, UserError
+from sumo_cohesion.experiments.simulation import prepare
+from sumo_cohesion.state import CartesianState, Scene
+from sumo_cohesion.traffic.contact import contacts
+from sumo_cohesion.traffic.simulator import Simulator, SumoRun
+from tests.conftest import NETWORKS, ROOT
+
+HEAD = (
+    '<routes><vType id="car" laneChangeModel="SL2015" length="5" width="1.8" speedDev="0"/>'
+    '<route id="r" edges="west east"/>'
+)
+
+
+def vehicle(name: str, lane: int, position: float, speed: float, stop: bool = False) -> str:
+    halt = (
+        f'<stop lane="west_{lane}" startPos="{position - 10}" endPos="{position}" duration="1e5"/>'
+    )
+    return (
+        f'<vehicle id="{name}" type="car" route="r" depart="0" departLane="{lane}" '
+        f'departPos="{position}" departSpeed="{speed}" insertionChecks="none">'
+        f"{halt if stop else ''}</vehicle>"
+    )
+
+
+@contextmanager
+def simulation(folder: Path, *vehicles: str) -> Iterator[Simulator]:
+    demand = folder / "demand.rou.xml"
+    demand.write_text(HEAD + "".join(sorted(vehicles)) + "</routes>")
+    run = SumoRun(ROOT / "networks" / "highway.net.xml", demand, (), 0, 0.8)
+    with Simulator(run, (5.0, 1.8), 250.0) as sumo:
+        yield sumo
+
+
+def test_scene_is_metric_centred_and_counter_clockwise(tmp_path: Path) -> None:
+    with simulation(tmp_path, vehicle("ego", 0, 100, 25), vehicle("b", 2, 160, 20)) as sumo:
+        scene = sumo.insert_ego(latest=5.0)
+    assert scene.ego[:3] == pytest.approx((97.5, -8.75, 0.0))  # front bumper at 100
+    assert scene.ids == ("b",)
+    assert scene.states[0] == pytest.approx([157.5, -1.75, 0.0, 20.0])
+    assert scene.sizes.tolist() == [[5.0, 1.8]]
+
+
+def test_the_ego_is_where_it_was_put_at_the_speed_it_was_driven(tmp_path: Path) -> None:
+    with simulation(tmp_path, vehicle("ego", 1, 100, 25), vehicle("b", 2, 160, 20)) as sumo:
+        ego = sumo.insert_ego(latest=5.0).ego
+        sumo.take_over()
+        reported = []
+        for k in range(200):
+            # Faster than any limit, weaving across the lanes, then a dead stop.
+            speed = 45.0 if k < 100 else 0.0
+            heading = 0.04 * math.sin(0.1 * k)
+            ego = CartesianState(
+                ego.x + 0.1 * speed * math.cos(heading),
+                ego.y + 0.1 * speed * math.sin(heading),
+                heading,
+                speed,
+            )
+            sumo.step(ego)
+            scene = sumo.read()  # raises if SUMO's ego is elsewhere
+            assert scene.ego == ego
+            reported.append(sumo._sumo.vehicle.getSpeed("ego"))
+        assert reported[1:100] == pytest.approx([45.0] * 99, abs=0.05)
+        assert reported[101:] == pytest.approx([0.0] * 99, abs=0.01)
+
+
+def test_an_ego_beside_the_road_is_still_where_it_was_put(tmp_path: Path) -> None:
+    with simulation(tmp_path, vehicle("ego", 1, 100, 25), vehicle("b", 2, 160, 20)) as sumo:
+        ego = sumo.insert_ego(latest=5.0).ego
+        sumo.take_over()
+        for k in range(100):
+            ego = CartesianState(ego.x + 2.5, -5.25 + 0.3 * k, 0.1, 25.0)
+            sumo.step(ego)
+            scene = sumo.read()
+            assert scene.ego == ego
+            assert scene.ids == ("b",)  # others are seen from there, too
+
+
+def test_a_place_that_is_no_number_never_reaches_sumo(tmp_path: Path) -> None:
+    with simulation(tmp_path, vehicle("ego", 1, 100, 25)) as sumo:
+        ego = sumo.insert_ego(latest=5.0).ego
+        with pytest.raises(SimulationError, match="no number"):
+            sumo.step(ego._replace(x=float("nan")))
+
+
+def test_one_simulation_per_process(tmp_path: Path) -> None:
+    with simulation(tmp_path, vehicle("ego", 1, 100, 25)) as sumo:
+        sumo.insert_ego(latest=5.0)
+        with pytest.raises(SimulationError, match="already running"), simulation(tmp_path):
+            pass
+        sumo.step(None)  # the first one is unharmed
+        assert sumo.read().time == pytest.approx(0.2)
+
+
+def test_leaving_with_a_move_pending_does_not_crash_the_next_run(tmp_path: Path) -> None:
+    for _ in range(3):
+        with simulation(tmp_path, vehicle("ego", 1, 100, 25)) as sumo:
+            ego = sumo.insert_ego(latest=5.0).ego
+            sumo._sumo.vehicle.moveToXY("ego", "", -1, ego.x + 5, ego.y, 90.0, 2)
+            sumo._stepped = False
+
+
+def test_an_ego_that_cannot_depart_is_reported(tmp_path: Path) -> None:
+    with (
+        simulation(tmp_path, vehicle("b", 1, 100, 25)) as sumo,
+        pytest.raises(UserError, match="has not inserted the ego"),
+    ):
+        sumo.insert_ego(latest=3.0)
+
+
+def approach(lateral: float, heading: float = 0.0) -> Callable[[float], CartesianState]:
+    """Ego driving at 15 m/s at a lateral offset from lane 0's centre, from x = 150."""
+    return lambda t: CartesianState(150 + 15 * t, -8.75 + lateral, heading, 15.0)
+
+
+@pytest.mark.parametrize(
+    ("lateral", "heading", "expected"),
+    [
+        (0.0, 0.0, True),  # same lane
+        (1.79, 0.0, True),  # side-swipe, centre beyond the lane line
+        (1.7, 0.0, True),  # side-swipe, centre still in lane 0: SUMO misses such contacts
+        (1.81, 0.0, False),
+        (2.2, 0.25, True),  # only a corner, of a slanted ego
+        (3.5, 0.0, False),  # passes in the next lane
+    ],
+)
+def test_constructed_contacts_are_found_in_sumo(
+    tmp_path: Path, lateral: float, heading: float, expected: bool
+) -> None:
+    path = approach(lateral, heading)
+    found: list[Scene] = []
+    with simulation(
+        tmp_path, vehicle("ego", 0, 140, 15), vehicle("s", 0, 200, 0, stop=True)
+    ) as sumo:
+        scene = sumo.insert_ego(latest=5.0)
+        sumo.take_over()
+        for k in range(60):
+            sumo.step(path(0.1 * k))
+            scene = sumo.read()
+            if contacts(scene.ego, scene.ego_size, scene.states, scene.sizes).size:
+                found.append(scene)
+    assert bool(found) is expected
+    if lateral == 0.0:
+        # Both stand on one line: contact begins when the bumpers meet, 5 m between centres.
+        assert found[0].states[0, 0] - found[0].ego.x == pytest.approx(5.0, abs=1.5)
+
+
+def test_own_contacts_agree_with_sumo_in_the_same_lane(tmp_path: Path) -> None:
+    own, reported = [], []
+    with simulation(
+        tmp_path, vehicle("ego", 0, 140, 15), vehicle("s", 0, 200, 0, stop=True)
+    ) as sumo:
+        sumo.insert_ego(latest=5.0)
+        sumo.take_over()
+        for k in range(60):
+            sumo.step(approach(0.0)(0.1 * k))
+            scene = sumo.read()
+            own.append(bool(contacts(scene.ego, scene.ego_size, scene.states, scene.sizes).size))
+            reported.append(sumo.reported_contacts() == ["s"])
+    # SUMO reports the same steps, to within one at either end.
+    assert abs(sum(own) - sum(reported)) <= 2
+    assert own.index(True) == pytest.approx(reported.index(True), abs=1)
+
+
+def test_curved_road_in_closed_loop(tmp_path: Path) -> None:
+    """The nominal ego keeps its lane around a 500 m curve and across a junction."""
+    (tmp_path / "curve.toml").write_text(
+        'name = "curve"\nsummary = "curve"\nnetwork = "curve.net.xml"\n'
+        'routes = ["curve.rou.xml"]\nduration = 40.0\n'
+        '[ego]\norigin = "straight"\ndestination = "bend_2"\nlane = 1\n'
+        "position = 20.0\nspeed = 20.0\n"
+        "[success]\noff_road = false\n"
+    )
+    (tmp_path / "curve.rou.xml").write_text(
+        '<routes><vType id="car" laneChangeModel="SL2015"/><vehicle id="a" type="car" depart="0" '
+        'departLane="0" departPos="60"><route edges="straight bend_1 bend_2"/></vehicle></routes>'
+    )
+    (tmp_path / "curve.net.xml").write_text((NETWORKS / "curve.net.xml").read_text())
+    from sumo_cohesion.experiments.simulation import run
+
+    rollout = run(tmp_path / "curve.toml", "nominal")
+    row = rollout.metrics.iloc[0]
+    assert row["outcome"] == "route_end"
+    assert not row["collision"]
+    assert not row["off_road"]
+    ego = rollout.trajectory[rollout.trajectory["vehicle"] == "ego"]
+    assert np.abs(ego["d"] - 3.5).max() < 0.3
+    # The limit falls from 25 to 20 m/s on the second half of the curve.
+    assert ego["speed"].iloc[-1] == pytest.approx(20.0, abs=0.5)
+    assert ego["speed"].max() > 22.0
+
+
+def test_export_opens_in_plain_sumo(tmp_path: Path) -> None:
+    from sumo_cohesion.experiments.export import export_scenario
+
+    config = export_scenario("stalled", tmp_path / "out", seed=3)
+    assert {p.name for p in config.parent.iterdir()} == {
+        "scenario.sumocfg", "demand.rou.xml", "highway.net.xml",
+    }  # fmt: skip
+    sumo = Path(sys.executable).parent / "sumo"
+    if not sumo.exists():
+        pytest.skip("SUMO's programs are in the extra [gui]")
+    done = subprocess.run(
+        [sumo, "-c", config, "--end", "30", "--fcd-output", tmp_path / "fcd.xml"],
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    ids = {v.get("id") for v in ET.parse(tmp_path / "fcd.xml").iter("vehicle")}
+    assert {"ego", "stalled", "lead_1"} <= ids
+
+
+def test_demand_varies_with_the_seed_as_the_scenario_says(tmp_path: Path) -> None:
+    counts, gaps, speeds, stalls = set(), [], [], []
+    for seed in range(60):
+        setup = prepare("stalled", "sumo", seed)
+        setup.write_inputs(tmp_path)
+        vehicles = {v.get("id"): v for v in ET.parse(tmp_path / "demand.rou.xml").iter("vehicle")}
+        humans = {k: v for k, v in vehicles.items() if k not in ("ego", "stalled")}
+        counts.add(len(humans))
+        leads = [100.0] + [float(humans[f"lead_{i}"].get("departPos", 0)) for i in (1, 2, 3)]
+        gaps += np.diff(leads).tolist()
+        speeds += [float(v.get("speedFactor", 0)) for v in humans.values()]
+        (stop,) = vehicles["stalled"].iter("stop")
+        stalls.append(float(vehicles["stalled"].get("departPos", 0)))
+        assert float(stop.get("endPos", 0)) == pytest.approx(stalls[-1])
+    assert counts == {3, 4, 5, 6, 7}
+    assert min(gaps) >= 50 - 1e-3
+    assert max(gaps) <= 70 + 1e-3
+    assert np.ptp(gaps) > 15
+    assert min(speeds) >= 0.98
+    assert max(speeds) <= 1.02
+    assert min(stalls) >= 690
+    assert max(stalls) <= 710

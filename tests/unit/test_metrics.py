@@ -1,0 +1,140 @@
+"""Metrics on hand-made trajectories with an obvious answer."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from sumo_cohesion.experiments import metrics
+from sumo_cohesion.experiments.statistics import mean_interval, summarize, wilson
+
+
+def car(name: str, s: np.ndarray, d: float = 0.0, dt: float = 0.1) -> pd.DataFrame:
+    speed = np.gradient(s, dt) if len(s) > 1 else np.zeros(1)
+    n = len(s)
+    return pd.DataFrame(
+        {
+            "time": np.round(dt * np.arange(n), 6),
+            "vehicle": name,
+            "s": s,
+            "d": np.full(n, d),
+            "speed": speed,
+            "heading": np.zeros(n),
+            "road_heading": np.zeros(n),
+            "lane": np.zeros(n, dtype=int),
+            "length": 5.0,
+            "width": 1.8,
+        }
+    )
+
+
+TIME = 0.1 * np.arange(51)
+
+
+def test_gap_ttc_and_drac_by_hand() -> None:
+    # 20 m/s behind a car standing 105 m ahead (100 m bumper to bumper), for 4 s: 20 m remain.
+    ego = car("ego", 20.0 * TIME[:41])
+    lead = car("lead", np.full(41, 105.0))
+    result = metrics.gap_metrics(ego, lead)
+    assert result["min_gap"] == pytest.approx(20.0)
+    assert result["min_ttc"] == pytest.approx(1.0)
+    assert result["max_drac"] == pytest.approx(20.0**2 / (2 * 20.0))
+
+
+def test_cars_beside_behind_or_faster_are_no_threat() -> None:
+    ego = car("ego", 20.0 * TIME)
+    beside = car("beside", 10.0 + 15.0 * TIME, d=3.5)
+    behind = car("behind", -30.0 + 25.0 * TIME)
+    result = metrics.gap_metrics(ego, pd.concat([beside, behind]))
+    assert all(np.isnan(v) for v in result.values())
+    faster = metrics.gap_metrics(ego, car("faster", 30.0 + 25.0 * TIME))
+    assert faster["min_gap"] == pytest.approx(25.0)
+    assert np.isnan(faster["min_ttc"])
+
+
+def test_post_encroachment_time_is_the_time_gap_behind_the_rear() -> None:
+    # Both at 20 m/s, centres 45 m apart: the ego's front is 40 m behind the lead's rear: 2 s.
+    ego = car("ego", 20.0 * TIME)
+    assert metrics.post_encroachment_time(ego, car("a", 45.0 + 20.0 * TIME)) == pytest.approx(2.0)
+    assert np.isnan(metrics.post_encroachment_time(ego, car("a", 45.0 + 20.0 * TIME, d=3.5)))
+    assert np.isnan(metrics.post_encroachment_time(ego, car("a", np.full(51, 500.0))))
+
+
+def test_jerk_and_lateral_acceleration() -> None:
+    ego = car("ego", 10.0 * TIME)
+    ego["speed"] = 10.0 + 0.5 * 3.0 * TIME**2  # jerk 3 m/s³
+    assert metrics.max_jerk(ego) == pytest.approx(3.0)
+    ego["speed"], ego["heading"] = 20.0, 0.1 * TIME  # yaw rate 0.1 rad/s
+    assert metrics.max_lateral_acceleration(ego) == pytest.approx(2.0)
+
+
+def test_hard_brakes_count_onsets_not_steps_and_no_gaps() -> None:
+    human = car("a", 20.0 * TIME)
+    human["speed"] = np.concatenate(
+        [
+            np.full(10, 25.0),
+            25.0 - 0.6 * np.arange(10),
+            np.full(10, 19.0),
+            19.0 - 0.5 * np.arange(21),
+        ]
+    )
+    assert metrics.human_metrics(human, [])["human_hard_brakes"] == 2
+    lost = human.drop(index=range(11, 19))
+    assert metrics.human_metrics(lost.iloc[:15], [])["human_hard_brakes"] == 1
+    assert metrics.human_metrics(human, ["a"])["human_hard_brakes"] == 0
+
+
+def test_off_road_is_when_the_side_crosses_the_edge() -> None:
+    plan = pd.DataFrame({"road_right": np.full(51, -1.75), "road_left": np.full(51, 8.75)})
+    assert not metrics.off_road(car("ego", TIME, d=-0.84), plan)
+    assert metrics.off_road(car("ego", TIME, d=-0.86), plan)
+
+
+@pytest.mark.parametrize(
+    ("conditions", "expected"),
+    [
+        ({"collision": False}, True),
+        ({"collision": True}, False),
+        ({"distance": {"min": 600, "max": None}}, True),
+        ({"distance": {"min": None, "max": 600}}, False),
+        ({"min_ttc": {"min": 1.0}}, False),  # undefined is no success
+        ({"collision": False, "distance": {"min": 700}}, False),
+    ],
+)
+def test_success_conditions(conditions: dict[str, object], expected: bool) -> None:
+    row = {"collision": False, "distance": 650.0, "min_ttc": np.nan}
+    assert metrics.succeeded(row, conditions) is expected
+
+
+def test_wilson_interval_against_the_published_formula() -> None:
+    k, n, z = 47, 50, 1.959963984540054
+    p = k / n
+    centre = (p + z**2 / (2 * n)) / (1 + z**2 / n)
+    half = z / (1 + z**2 / n) * np.sqrt(p * (1 - p) / n + z**2 / (4 * n**2))
+    assert wilson(k, n) == pytest.approx((p, centre - half, centre + half))
+
+
+def test_mean_interval_covers_and_is_repeatable() -> None:
+    values = np.random.default_rng(0).normal(5.0, 1.0, 100).tolist()
+    mean, low, high = mean_interval(values)
+    assert low < mean < high
+    assert high - low == pytest.approx(2 * 1.96 * 0.1, rel=0.25)
+    assert mean_interval(values) == (mean, low, high)
+    assert mean_interval([3.0, 3.0]) == (3.0, 3.0, 3.0)
+    assert mean_interval([3.0]) == (3.0, 3.0, 3.0)
+    assert mean_interval([0.0, 0.0, 1.0])[0] == pytest.approx(1 / 3)
+
+
+def test_summary_counts_only_runs_where_the_metric_is_defined() -> None:
+    from sumo_cohesion.experiments.columns import METRICS
+
+    zeros = {"string": "", "bool": False, "int64": 0, "float64": 1.0}
+    row = {c.name: zeros[c.dtype] for c in METRICS}
+    runs = pd.DataFrame(
+        [{**row, "planner": "a", "success": True}, {**row, "planner": "a", "min_ttc": np.nan}]
+    )
+    summary = summarize(runs).set_index("metric")
+    assert summary.loc["success", "value"] == 0.5
+    assert summary.loc["min_ttc", "n"] == 1
+    assert summary.loc["min_gap", "n"] == 2

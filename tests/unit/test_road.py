@@ -1,0 +1,124 @@
+"""The Frenet frame: closed-form answers on a straight and on a 500 m curve."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sumo_cohesion.errors import UserError
+from sumo_cohesion.road import Road
+from sumo_cohesion.traffic.network import Network
+from tests.conftest import NETWORKS
+
+
+def test_round_trip_on_a_500_m_curve_is_within_2_cm(curve: Road) -> None:
+    rng = np.random.default_rng(1)
+    states = np.column_stack(
+        [
+            rng.uniform(0, curve.length, 3000),
+            rng.uniform(-15, 15, 3000),
+            rng.uniform(-1, 1, 3000),
+            rng.uniform(0, 30, 3000),
+        ]
+    )
+    cartesian = curve.to_cartesian(states)
+    back, _ = curve.to_frenet(cartesian)
+    again = curve.to_cartesian(back)
+    assert np.abs(again[:, :2] - cartesian[:, :2]).max() < 0.02
+    assert np.abs(back - states).max() < 1e-6
+
+
+def test_curve_has_the_radius_it_was_drawn_with(curve: Road) -> None:
+    # networks/curve: 100 m straight, then a left curve whose edge line has a radius of 500 m;
+    # the rightmost of two 3.5 m lanes runs 5.25 m outside it.
+    assert curve.curvature_at(50.0) == pytest.approx(0.0, abs=1e-6)
+    middle = curve.curvature[curve.index(np.arange(200, 450))]
+    assert np.median(middle) == pytest.approx(1 / 505.25, rel=0.02)
+
+
+def test_a_circle_driven_at_constant_offset_keeps_its_distance(curve: Road) -> None:
+    # Points on a circle of radius 510 m about (0, 500): 4.75 m outside the reference lane.
+    angle = np.linspace(0.3, 0.6, 200)
+    points = np.column_stack([510 * np.sin(angle), 500 - 510 * np.cos(angle)])
+    states = np.column_stack([points, angle, np.full(200, 20.0)])
+    frenet, _ = curve.to_frenet(states)
+    assert frenet[:, 1] == pytest.approx(-4.75, abs=0.03)
+    assert frenet[:, 2] == pytest.approx(0.0, abs=0.003)
+    # 510 m radius seen from a line of 505.25 m: s advances by the ratio of the radii.
+    assert np.diff(frenet[:, 0]) == pytest.approx(np.diff(angle) * 505.25, rel=0.01)
+
+
+def test_s_is_continuous_on_both_sides_of_a_curve(curve: Road) -> None:
+    for radius in (490.0, 520.0):
+        angle = np.linspace(0.2, 0.7, 5000)
+        states = np.column_stack(
+            [radius * np.sin(angle), 500 - radius * np.cos(angle), angle, np.ones(5000)]
+        )
+        step = np.diff(curve.to_frenet(states)[0][:, 0])
+        assert step.min() > 0.5 * step.mean()
+        assert step.max() < 1.5 * step.mean()
+
+
+@given(x=st.floats(-90, 2090), y=st.floats(-60, 60))
+def test_straight_road_is_the_identity(x: float, y: float) -> None:
+    network = Network(NETWORKS.parent.parent / "networks" / "highway.net.xml")
+    road = _cached_road(network)
+    s, d, heading, curvature = road.project(x, y)
+    assert (s, d) == pytest.approx((x, y + 8.75), abs=1e-6)
+    assert (heading, curvature) == pytest.approx((0.0, 0.0), abs=1e-9)
+
+
+_ROADS: dict[str, Road] = {}
+
+
+def _cached_road(network: Network) -> Road:
+    return _ROADS.setdefault("highway", network.road(["west", "east"]))
+
+
+def test_lanes_edges_and_limit_of_the_highway(highway: Road) -> None:
+    assert highway.length == pytest.approx(2000.0)
+    assert highway.lanes_at([0, 999.9, 1000.1, 1999])[:, :3] == pytest.approx(
+        np.tile([0.0, 3.5, 7.0], (4, 1))
+    )
+    right, left = highway.drivable_at([500.0], [0.0])
+    assert (right[0], left[0]) == pytest.approx((-1.75, 8.75))
+    assert highway.lane_index([10, 10, 10], [1.7, 1.8, 20]).tolist() == [0, 1, 2]
+    assert [highway.lane_of(10, d) for d in (1.7, 1.8, 20)] == [0, 1, 2]
+    assert highway.speed_limit_at(700.0) == 25.0
+
+
+def test_an_exit_is_drivable_until_it_has_parted(curve: Road) -> None:
+    assert curve.n_route_lanes == 2
+    exit_lane = curve.lane_centre[:, 2]
+    begins = curve.s0 + np.flatnonzero(~np.isnan(exit_lane))[0]
+    assert begins > 480.0
+    # Beside the gore the exit is part of the strip; farther on it is a strip of its own.
+    right, _ = curve.drivable_at([begins + 20.0], [0.0])
+    assert right[0] < -1.8
+    right, left = curve.drivable_at([begins + 100.0], [0.0])
+    assert (right[0], left[0]) == pytest.approx((-1.75, 5.25), abs=0.1)
+    assert curve.speed_limit_at([400.0, 600.0]).tolist() == [25.0, 20.0]
+
+
+def test_a_real_motorway_maps_without_holes() -> None:
+    sumo = pytest.importorskip("sumo", reason="ships with eclipse-sumo")
+    from pathlib import Path
+
+    path = Path(sumo.__file__).parent / "tools" / "game" / "highway" / "highway.net.xml"
+    if not path.is_file():
+        pytest.skip("this eclipse-sumo does not ship the motorway")
+    network = Network(path)
+    road = network.road(network.route("145354574", "153177820"))
+    inside = slice(int(-road.s0), int(road.length - road.s0))
+    assert not np.isnan(np.nanmin(road.lane_centre[inside], axis=1)).any()
+    assert np.isfinite(road.speed_limit).all()
+
+
+def test_routes_that_do_not_exist_say_so() -> None:
+    network = Network(NETWORKS / "curve.net.xml")
+    with pytest.raises(UserError, match="no way for a car from edge 'ramp' to edge 'bend_2'"):
+        network.route("ramp", "bend_2")
+    with pytest.raises(UserError, match=r"has no edge 'nowhere'; its edges are bend_1"):
+        network.route("straight", "nowhere")

@@ -1,0 +1,208 @@
+"""Who, what and when: closed-form answers."""
+
+from __future__ import annotations
+
+from math import atan2, hypot
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from sumo_cohesion.perception.history import History
+from sumo_cohesion.road import Road
+from sumo_cohesion.social.agreement import Agreement, agree, combine, elect_lateral
+from sumo_cohesion.social.features import FEATURES, SCALES, social_features
+from sumo_cohesion.social.groups import group_votes
+from sumo_cohesion.social.settings import CohesionSettings
+from sumo_cohesion.state import Observation, RoadState
+
+SETTINGS = CohesionSettings()
+
+
+def observe(
+    time: float, cars: dict[str, tuple[float, float, float]], special: str = ""
+) -> Observation:
+    """Cars by name: s, d, speed."""
+    states = np.array([[s, d, 0.0, v] for s, d, v in cars.values()]).reshape(-1, 4)
+    return Observation(
+        time=time,
+        ego=RoadState(0.0, 0.0, 0.0, 25.0),
+        ego_size=(5.0, 1.8),
+        ids=tuple(cars),
+        states=states,
+        sizes=np.tile([5.0, 1.8], (len(cars), 1)),
+        curvature=np.zeros(len(cars)),
+        voter=tuple(name != special for name in cars),
+    )
+
+
+def history(memory: float = 20.0) -> History:
+    return History(0.1, 0.5, memory, social_features)
+
+
+def drive(h: History, steps: int, cars: dict[str, tuple[float, float, float, float]]) -> None:
+    """Cars by name: s, d, speed along, speed across."""
+    for k in range(steps):
+        t = 0.1 * k
+        h.push(
+            observe(t, {n: (s + v * t, d + w * t, hypot(v, w)) for n, (s, d, v, w) in cars.items()})
+        )
+
+
+def test_features_by_hand() -> None:
+    psi = dict(zip(FEATURES, social_features((0, 0, 0, 20), (3, 4, 0.3, 20), 1.0), strict=True))
+    scale = dict(zip(FEATURES, SCALES, strict=True))
+    assert psi["lateral"] * scale["lateral"] == pytest.approx(4.0)
+    assert psi["longitudinal"] * scale["longitudinal"] == pytest.approx(3.0)
+    assert psi["heading"] * scale["heading"] == pytest.approx(0.3)
+    assert psi["distance"] * scale["distance"] == pytest.approx(5.0)
+    assert psi["direction"] * scale["direction"] == pytest.approx(0.8)
+
+
+def test_features_are_the_same_in_casadi_and_for_arrays() -> None:
+    rng = np.random.default_rng(0)
+    before, after = rng.normal(size=(4, 7)), rng.normal(size=(4, 7))
+    arrays = np.array(social_features(before, after, 0.5, 0.01))
+    x, y = ca.SX.sym("x", 4), ca.SX.sym("y", 4)
+    psi = ca.vertcat(*social_features(ca.vertsplit(x), ca.vertsplit(y), 0.5, 0.01))
+    symbolic = ca.Function("psi", [x, y], [psi])
+    for k in range(7):
+        assert np.asarray(symbolic(before[:, k], after[:, k])).ravel() == pytest.approx(
+            arrays[:, k]
+        )
+        one = social_features(tuple(before[:, k]), tuple(after[:, k]), 0.5, 0.01)
+        assert one == pytest.approx(arrays[:, k].tolist())
+
+
+def test_a_car_that_stands_has_no_direction_and_a_finite_gradient() -> None:
+    state = (10.0, 1.0, 0.0, 0.0)
+    assert social_features(state, state, 0.5)[4] == 0.0
+    y = ca.SX.sym("y", 4)
+    psi = ca.vertcat(*social_features(state, ca.vertsplit(y), 0.5))
+    jacobian = ca.Function("j", [y], [ca.jacobian(psi, y)])
+    assert np.isfinite(np.asarray(jacobian(state))).all()
+
+
+def test_on_a_curve_equal_speeds_in_two_lanes_are_equal_features() -> None:
+    # Both drive 10 m; the outer car's s advances less (radius 100 m, left curve).
+    for d in (0.0, -3.5):
+        along = 10.0 / (1.0 - 0.01 * d)
+        psi = social_features((0, d, 0, 20), (along, d, 0, 20), 0.5, 0.01)
+        assert psi[1] * SCALES[1] == pytest.approx(20.0)
+
+
+def test_history_transitions_span_half_a_second_and_headings_are_of_displacement() -> None:
+    h = history()
+    drive(h, 20, {"a": (100.0, 0.0, 20.0, 1.0)})
+    (track,) = h.in_sight()
+    assert track.state[2] == pytest.approx(atan2(1.0, 20.0))
+    psi = track.newest()
+    assert psi is not None
+    assert psi[0] * SCALES[0] == pytest.approx(1.0)
+    assert psi[1] * SCALES[1] == pytest.approx(20.0)
+    assert psi[2] == pytest.approx(0.0, abs=1e-9)
+    assert track.middle_s[-1] == pytest.approx(100.0 + 20.0 * (1.9 - 0.25))
+    assert len(track.steps) == 20 - 5
+
+
+def test_history_bridges_no_gap() -> None:
+    h = history()
+    for k in range(20):
+        seen = {"a": (10.0 * k, 0.0, 20.0)} if k != 10 else {}
+        h.push(observe(0.1 * k, seen))
+    (track,) = h.in_sight()
+    # Steps 5 to 9, and again from 16 on, five steps after it came back.
+    assert track.steps == [5, 6, 7, 8, 9, 16, 17, 18, 19]
+
+
+def test_history_memory_is_bounded() -> None:
+    h = history(memory=2.0)
+    for k in range(2000):
+        # A new car every 10 steps, each seen for 50 steps.
+        names = {
+            f"car_{c}": (5.0 * (k - 10 * c), 0.0, 50.0) for c in range(k // 10 - 4, k // 10 + 1)
+        }
+        h.push(observe(0.1 * k, {n: v for n, v in names.items() if v[0] >= 0}))
+        assert sum(len(t.steps) for t in h.all()) <= 5 * 50
+        assert len(h.all()) <= 5 + 4
+
+
+def test_groups_who_votes_where(highway: Road) -> None:
+    h = history()
+    # Two cars drove through the ego's place (s = 300) and are now beyond both reaches; one
+    # follows in the ego's lane; one is beside it; one comes the other way.
+    drive(
+        h,
+        60,
+        {
+            "past_1": (270.0, 0.0, 25.0, 0.0),
+            "past_2": (250.0, 0.5, 25.0, 0.0),
+            "follower": (150.0, 0.0, 25.0, 0.0),
+            "beside": (150.0, 3.5, 25.0, 0.0),
+        },
+    )
+    ego = RoadState(300.0, 0.0, 0.0, 25.0)
+    votes = group_votes(ego, h, highway, SETTINGS)
+    assert len(votes["position"]) == 2
+    # follower and beside are at 297.5: 2.5 m behind the ego.
+    assert len(votes["lane"]) == 1
+    assert len(votes["road"]) == 2
+    wide = SETTINGS.model_copy(update={"road_reach": 200.0, "lane_ahead": 200.0})
+    votes = group_votes(ego, h, highway, wide)
+    assert len(votes["lane"]) == 3
+    assert len(votes["road"]) == 4
+
+
+def test_special_and_oncoming_vehicles_do_not_vote(highway: Road) -> None:
+    h = history()
+    for k in range(10):
+        cars = {"ambulance": (300 + 3.0 * k, 0.0, 30.0), "oncoming": (330 - 3.0 * k, 3.5, 30.0)}
+        observation = observe(0.1 * k, cars, special="ambulance")
+        observation.states[1, 2] = np.pi
+        h.push(observation)
+    votes = group_votes(RoadState(300.0, 0.0, 0.0, 25.0), h, highway, SETTINGS)
+    assert votes == {"position": votes["position"], "lane": [], "road": []}
+    assert len(votes["position"]) <= 1
+
+
+def test_agreement_is_mean_and_unbiased_variance() -> None:
+    rng = np.random.default_rng(3)
+    rows = [tuple(row) for row in rng.normal(size=(6, 5)).tolist()]
+    group, lonely = agree({"road": rows, "lane": rows[:1]}, SETTINGS)
+    assert group.mean == pytest.approx(np.mean(rows, axis=0))
+    assert group.variance == pytest.approx(np.var(rows, axis=0, ddof=1))
+    assert group.weight == pytest.approx(1 / (np.var(rows, axis=0, ddof=1) + 2.5e-3))
+    assert (lonely.n, lonely.weight) == (1, (0.0,) * 5)
+
+
+def test_perfect_agreement_has_the_floors_weight() -> None:
+    (group,) = agree({"road": [(0.1, 2.0, 0.0, 2.0, 0.3)] * 3}, SETTINGS)
+    assert group.variance == pytest.approx([0.0] * 5, abs=1e-12)
+    assert group.weight == pytest.approx([400.0] * 5)
+
+
+def test_only_the_most_surprising_group_steers_but_all_set_the_speed() -> None:
+    turn = Agreement("position", 3, (1.0, 2.5, 0.5, 2.5, 1.0), (0.0,) * 5, (400.0,) * 5)
+    straight = Agreement("road", 4, (0.0, 2.5, 0.0, 2.5, 0.0), (0.0,) * 5, (400.0,) * 5)
+    elected = elect_lateral((turn, straight))
+    assert elected[0].weight == (400.0,) * 5
+    assert elected[1].weight == (0.0, 400.0, 0.0, 400.0, 0.0)
+    assert elect_lateral((straight, straight)) == (straight, straight)
+
+
+def test_combined_term_differs_from_the_groups_sum_by_a_constant() -> None:
+    rng = np.random.default_rng(5)
+    groups = [
+        Agreement(g, 3, *(tuple(row) for row in rng.uniform(0.1, 2, size=(3, 5)).tolist()))
+        for g in ("position", "lane", "road")
+    ]
+    term = combine(groups)
+
+    def by_group(psi: np.ndarray) -> float:
+        return sum(float(np.dot(g.weight, (np.array(g.mean) - psi) ** 2)) for g in groups)
+
+    def combined(psi: np.ndarray) -> float:
+        return float(np.dot(term.weight, (np.array(term.target) - psi) ** 2))
+
+    gaps = [by_group(psi) - combined(psi) for psi in rng.normal(size=(10, 5))]
+    assert np.ptp(gaps) == pytest.approx(0.0, abs=1e-9)
