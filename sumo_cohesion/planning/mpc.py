@@ -109,7 +109,7 @@ class Mpc:
         states = [ca.SX.sym(f"x{t}", 4) for t in range(horizon + 1)]
         controls = [ca.SX.sym(f"u{t}", 2) for t in range(horizon)]
 
-        unknowns, constraints, is_equality = [], [], []
+        unknowns, constraints = [], []
         total: dict[str, Any] = dict.fromkeys(RewardWeights.model_fields, ca.SX(0))
         cohesion = ca.SX(0)
         for t in range(horizon):
@@ -146,28 +146,33 @@ class Mpc:
             ca.vertcat(*map(ca.vec, p.values())),
         )
         objective = -(ca.vertcat(*total.values(), cohesion))
-        is_equality = [True] * g.shape[0]
-        self._n = z.shape[0]
         nlp = {"x": z, "p": parameters, "f": ca.sum1(objective), "g": g}
-        self._solver = ca.nlpsol("mpc", self.settings.solver, nlp, self._options(is_equality))
+        self._nlp = nlp
+        self._n_constraints = g.shape[0]
+        self._solver = self._make_solver(self.settings.solver)
+        self._second: Any = None
         self._terms = ca.Function("terms", [z, parameters], [-objective])
         self._term_names = (*total, "cohesion")
-        self._n_constraints = g.shape[0]
 
-    def _options(self, is_equality: list[bool]) -> dict[str, Any]:
-        common = {"print_time": False, "error_on_fail": False, "record_time": False}
-        if self.settings.solver == "ipopt":
-            return common | {
-                "ipopt.print_level": 0,
-                "ipopt.sb": "yes",
-                "ipopt.max_iter": self.settings.max_iterations,
+    def _make_solver(self, name: str) -> Any:
+        options: dict[str, Any] = {"print_time": False, "error_on_fail": False}
+        iterations = self.settings.max_iterations
+        if name == "fatrop":
+            options |= {
+                "structure_detection": "auto",
+                "equality": [True] * self._n_constraints,
+                "fatrop.print_level": 0,
+                "fatrop.max_iter": iterations,
             }
-        return common | {
-            "structure_detection": "auto",
-            "equality": is_equality,
-            "fatrop.print_level": 0,
-            "fatrop.max_iter": self.settings.max_iterations,
-        }
+        else:
+            options |= {"ipopt.print_level": 0, "ipopt.sb": "yes", "ipopt.max_iter": iterations}
+        return ca.nlpsol(name, name, self._nlp, options)
+
+    def _rescue(self) -> Any:
+        """IPOPT, slower and sturdier, for what the chosen solver cannot solve; built if needed."""
+        if self._second is None:
+            self._second = self._make_solver("ipopt")
+        return self._second
 
     def reset(self) -> None:
         """Forget the last solution."""
@@ -181,21 +186,20 @@ class Mpc:
             return self._failed("input is not finite", 0, 0.0)
         ego = RoadState(*problem.ego)
         lower, upper = self._bounds(ego.speed)
-        guesses = [self._hold(problem)]
-        if self._warm is not None:
-            guesses.insert(0, self._warm)
+        hold = self._hold(problem)
+        attempts = [(self._solver, hold if self._warm is None else self._warm)]
         iterations, status, solved, z = 0, "", False, np.empty(0)
         start = time.perf_counter()
-        # A solve that fails from the last solution is tried once more from a fresh start.
-        for guess in guesses:
-            result = self._solver(x0=guess, p=parameters, lbx=lower, ubx=upper, lbg=0.0, ubg=0.0)
-            stats = self._solver.stats()
+        while attempts and not solved:
+            solver, guess = attempts.pop()
+            result = solver(x0=guess, p=parameters, lbx=lower, ubx=upper, lbg=0.0, ubg=0.0)
+            stats = solver.stats()
             z = np.asarray(result["x"]).ravel()
             iterations += int(stats["iter_count"])
             solved = bool(stats["success"]) and bool(np.isfinite(z.sum()))
-            status = f"{self.settings.solver} returned {stats['return_status']}"
-            if solved:
-                break
+            status = f"{solver.name()} returned {stats['return_status']}"
+            if not solved and solver is self._solver:
+                attempts.append((self._rescue(), hold))
         wall_time = time.perf_counter() - start
         if not solved:
             self._warm = None

@@ -212,8 +212,8 @@ def fallback(
     """Plan without a solver: brake in the lane the ego is in."""
     ego = observation.ego
     centre = float(road.lanes_at(ego.s)[road.lane_index(ego.s, ego.d)])
-    # Steer so that heading and offset from the lane's centre decay over about two seconds.
-    reach = max(2.0 * ego.speed, 10.0)
+    # Steer so that heading and offset from the lane's centre decay within about a second.
+    reach = max(0.7 * ego.speed, 5.0)
     bend = -2.0 * ego.heading / reach - (ego.d - centre) / reach**2
     curvature = float(road.curvature_at(ego.s)) + bend
     curvature = float(np.clip(curvature, -settings.max_curvature, settings.max_curvature))

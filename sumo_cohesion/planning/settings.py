@@ -49,7 +49,7 @@ class PlannerSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    horizon: Annotated[int, Field(ge=1, le=100)] = 5
+    horizon: Annotated[int, Field(ge=1, le=100)] = 10
     friction: NonNegative = 0.1
     max_curvature: Positive = 0.01
     max_braking: Positive = 8.0

@@ -21,8 +21,8 @@ The paper normalises each feature by its maximum difference expected, so that a 
 radians can be compared with one in metres.
 """
 
-_STANDSTILL = 1e-3
-"""Metres; a car that does not move has no direction, and this keeps the direction at zero."""
+_STANDSTILL = 0.05
+"""Metres per transition; a car that hardly moves has no direction, and this fades it to zero."""
 
 
 def social_features(

@@ -44,7 +44,8 @@ def test_a_circle_driven_at_constant_offset_keeps_its_distance(curve: Road) -> N
     points = np.column_stack([510 * np.sin(angle), 500 - 510 * np.cos(angle)])
     states = np.column_stack([points, angle, np.full(200, 20.0)])
     frenet, _ = curve.to_frenet(states)
-    assert frenet[:, 1] == pytest.approx(-4.75, abs=0.03)
+    # The edge is drawn with chords of 10 m (2.5 cm inside the arc), and the frame rounds them.
+    assert frenet[:, 1] == pytest.approx(-4.75, abs=0.05)
     assert frenet[:, 2] == pytest.approx(0.0, abs=0.003)
     # 510 m radius seen from a line of 505.25 m: s advances by the ratio of the radii.
     assert np.diff(frenet[:, 0]) == pytest.approx(np.diff(angle) * 505.25, rel=0.01)
