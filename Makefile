@@ -5,7 +5,7 @@ NETCONVERT := $(BIN)/netconvert --offset.disable-normalization true --no-turnaro
 # Threads of the linear algebra library only cost time here: the matrices are tiny.
 export OPENBLAS_NUM_THREADS := 1
 
-.PHONY: demo test check format networks lock wheel benchmark clean
+.PHONY: demo test check format networks docs lock wheel benchmark clean
 
 demo: $(VENV)/.installed
 	$(BIN)/sumo-cohesion compare stalled --seeds 0:10 --out demo
@@ -33,6 +33,11 @@ networks: $(VENV)/.installed
 	  sed -i '/^<!--/,/^-->/d' $$b.net.xml; done
 	cd tests/networks && ../../$(NETCONVERT) -n curve.nod.xml -e curve.edg.xml -x curve.con.xml -o curve.net.xml && \
 	  sed -i '/^<!--/,/^-->/d' curve.net.xml
+
+docs: $(VENV)/.installed
+	$(BIN)/python -c "from sumo_cohesion.experiments.columns import describe_tables as d; print(d(), end='')" > docs/tables.md
+	$(BIN)/sumo-cohesion compare stalled_swerve --seeds 0:1 --out results/readme
+	cp results/readme/paths.png docs/stalled_swerve.png
 
 lock: $(VENV)/.installed
 	$(BIN)/uv pip compile pyproject.toml --all-extras --universal --no-annotate --no-header \

@@ -118,3 +118,18 @@ def as_table(name: str, data: dict[str, object] | list[dict[str, object]]) -> pd
     columns = TABLES[name]
     frame = pd.DataFrame(data, columns=[c.name for c in columns])
     return frame.astype({c.name: c.dtype for c in columns})
+
+
+def describe_tables() -> str:
+    """Describe all tables in Markdown: docs/tables.md is this text."""
+    parts = [
+        "# Tables\n",
+        "Every run's folder holds these tables as parquet, and `run.json`: scenario, planner,",
+        "settings, seed, versions and outcome. Made from `sumo_cohesion/experiments/columns.py` by",
+        "`make docs`.\n",
+    ]
+    for name, columns in TABLES.items():
+        parts += [f"## {name}\n", "| column | type | unit | meaning |", "|---|---|---|---|"]
+        parts += [f"| {c.name} | {c.dtype} | {c.unit} | {c.meaning} |" for c in columns]
+        parts.append("")
+    return "\n".join(parts)

@@ -28,8 +28,8 @@ def step(
     friction : linear friction (1/s).
     road_curvature : curvature (1/m) of the reference line at s.
 
-    >>> step((0.0, 0.0, 0.0, 20.0), (0.0, 2.0), 0.1, 0.1)
-    (2.0, 0.0, 0.0, 20.0)
+    >>> [float(v) for v in step((0.0, 0.0, 0.0, 20.0), (0.0, 2.0), 0.1, 0.1)]
+    [2.0, 0.0, 0.0, 20.0]
     """
     s, d, heading, speed = state
     curvature, acceleration = control

@@ -43,7 +43,7 @@ def social_features(
     The features named in FEATURES, without unit.
 
     >>> [round(f, 3) for f in social_features((0, 0, 0, 20), (10, 0.5, 0.06, 20), 0.5)]
-    [0.667, 2.0, 0.8, 2.002, 0.832]
+    [0.667, 2.0, 0.8, 2.003, 0.832]
     """
     across = after[1] - before[1]
     along = (after[0] - before[0]) * (1.0 - curvature * 0.5 * (before[1] + after[1]))

@@ -31,7 +31,7 @@ class CohesionSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    beta: NonNegative = 0.06
+    beta: NonNegative = 0.09
     variance_floor: Positive = 2.5e-3
     min_cars: Annotated[int, Field(ge=2)] = 2
     lateral_votes: Literal["all", "most_surprising"] = "most_surprising"

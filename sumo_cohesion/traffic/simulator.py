@@ -168,8 +168,9 @@ class Simulator:
         times that factor at the capped speed, and humans follow what is reported.
         """
         vehicle = self._sumo.vehicle
-        vehicle.setSpeedFactor(EGO, 3.0)
+        # In this order: setMaxSpeed gives the ego a type of its own, with speed factor 1.
         vehicle.setMaxSpeed(EGO, 70.0)
+        vehicle.setSpeedFactor(EGO, 3.0)
         vehicle.setSpeedMode(EGO, 0)
         vehicle.setLaneChangeMode(EGO, 0)
 
