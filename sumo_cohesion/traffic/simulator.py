@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import shutil
 import sys
 import tempfile
 from collections.abc import Iterator
@@ -111,17 +112,16 @@ class Simulator:
                 "a SUMO simulation is already running in this process, and a second one would "
                 "silently replace it; close it first, or use another process"
             )
-        libsumo = load_libsumo()
-        program = "sumo-gui" if self._run.gui else "sumo"
+        sumo, program = _load_window() if self._run.gui else (load_libsumo(), "sumo")
         with _captured_stderr() as said:
             try:
-                libsumo.start([program, *self._run.options()])
+                sumo.start([program, *self._run.options()])
             except Exception as error:
                 reason = _first_error(said()) or str(error)
                 raise UserError(f"SUMO cannot start this scenario: {reason}") from None
         _running = self._run.demand.name
-        self._sumo = libsumo
-        tc = libsumo.constants
+        self._sumo = sumo
+        tc = sumo.constants
         self._variables = (tc.VAR_POSITION, tc.VAR_ANGLE, tc.VAR_SPEED)
         return self
 
@@ -261,11 +261,12 @@ def load_libsumo() -> Any:
     UserError
         If libsumo is missing or too old.
     """
-    # libsumo prints a warning about pyarrow's version to standard output, which would spoil
-    # --json; this variable, read at import, turns it off (the two are not used together here).
-    os.environ.setdefault("LIBSUMO_AS_TRACI", "quiet")
     try:
-        import libsumo
+        # First, so that it is itself: with the variable below it would become libsumo.
+        import traci  # noqa: F401
+
+        with _quiet_import():
+            import libsumo
     except ImportError as error:
         raise UserError(f"libsumo cannot be loaded ({error}); pip install libsumo") from None
     version = sumo_version(libsumo)
@@ -276,10 +277,48 @@ def load_libsumo() -> Any:
     return libsumo
 
 
+@contextlib.contextmanager
+def _quiet_import() -> Iterator[None]:
+    """Keep libsumo from printing a warning about pyarrow's version, which would spoil --json.
+
+    Its import reads this variable. The two libraries are not used together here.
+    """
+    before = os.environ.get("LIBSUMO_AS_TRACI")
+    os.environ["LIBSUMO_AS_TRACI"] = "quiet"
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ["LIBSUMO_AS_TRACI"]
+        else:
+            os.environ["LIBSUMO_AS_TRACI"] = before
+
+
 def sumo_version(libsumo: Any) -> tuple[int, int]:
     """Return SUMO's version as (major, minor)."""
     major, minor = str(libsumo.__version__).split(".")[:2]
     return int(major), int(minor)
+
+
+def _load_window() -> tuple[Any, str]:
+    """Return traci, and the path of sumo-gui, which it drives from outside.
+
+    libsumo can show the window too, but does not always come back from closing it.
+    """
+    if sys.platform == "linux" and not os.environ.get("DISPLAY"):
+        raise UserError(
+            "--gui needs a screen and DISPLAY is not set; leave --gui out, or write the "
+            "scenario with `sumo-cohesion scenario export` and open it elsewhere"
+        )
+    program = shutil.which("sumo-gui") or shutil.which(
+        "sumo-gui", path=str(Path(sys.executable).parent)
+    )
+    if program is None:
+        raise UserError("--gui needs sumo-gui; pip install 'sumo-cohesion[gui]'")
+    load_libsumo()
+    import traci
+
+    return traci, program
 
 
 @contextlib.contextmanager

@@ -221,6 +221,12 @@ def test_a_full_disk_leaves_nothing_half_written(
     assert not any(Path().iterdir())
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="screens are found otherwise elsewhere")
+def test_no_screen_for_the_window(invoke: Invoke, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("DISPLAY", raising=False)
+    assert_one_line(invoke("run", "stalled", "--gui"), "--gui", "scenario export")
+
+
 def test_damaged_results_say_so(invoke: Invoke) -> None:
     assert invoke("run", "stalled", "--set", "duration=1.0", "--out", "run")[0] == 0
     (Path("run") / "trajectory.parquet").write_bytes(b"junk")

@@ -63,7 +63,7 @@ def test_the_ego_is_where_it_was_put_at_the_speed_it_was_driven(tmp_path: Path) 
         for k in range(200):
             # Faster than any limit, weaving across the lanes, then a dead stop.
             speed = 45.0 if k < 100 else 0.0
-            heading = 0.04 * math.sin(0.1 * k)
+            heading = 0.04 * math.sin(0.1 * k) if k < 100 else ego.heading
             ego = CartesianState(
                 ego.x + 0.1 * speed * math.cos(heading),
                 ego.y + 0.1 * speed * math.sin(heading),
