@@ -5,20 +5,21 @@ NETCONVERT := $(BIN)/netconvert --offset.disable-normalization true --no-turnaro
 # Threads of the linear algebra library only cost time here: the matrices are tiny.
 export OPENBLAS_NUM_THREADS := 1
 
-.PHONY: demo test check format networks docs lock wheel benchmark clean
+.PHONY: demo test lint check format networks docs lock wheel benchmark clean
 
 demo: $(VENV)/.installed
 	$(BIN)/sumo-cohesion compare stalled --seeds 0:10 --out demo
 	@echo "The picture is demo/paths.png"
 
 test: $(VENV)/.installed
-	$(BIN)/python -m pytest -q
+	$(BIN)/python -m pytest -q --cov --cov-report=term:skip-covered --cov-fail-under=85
 
-check: $(VENV)/.installed
+lint: $(VENV)/.installed
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
-	$(BIN)/python -m pytest -q --cov --cov-report=term:skip-covered --cov-fail-under=85
+
+check: lint test
 
 format: $(VENV)/.installed
 	$(BIN)/ruff format .
