@@ -102,6 +102,11 @@ class Road:
                 nearest, best = lane, abs(centre - d)
         return nearest
 
+    def nearest_lane(self, s: float, d: float) -> float:
+        """Lateral position (m) of the lane centre nearest to one point."""
+        i = min(max(round((s - self.s0) / SPACING), 0), self.x.size - 1)
+        return self._lane_rows[i][self.lane_of(s, d)]
+
     def drivable_at(self, s: ArrayLike, d: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Right and left border (m) of the paved strip that holds, or is nearest to, (s, d).
 

@@ -85,6 +85,15 @@ class Track:
         """Which transitions have their middle within ``reach`` (m) of s; cars do not reverse."""
         return slice(bisect_left(self.middle_s, s - reach), bisect_right(self.middle_s, s + reach))
 
+    def across(self, s: float) -> float | None:
+        """Where across the road (d, m) the car was when it passed s; None if that is unknown."""
+        after = bisect_right(self.middle_s, s)
+        if after == 0 or after == len(self.middle_s):
+            return None
+        s0, s1 = self.middle_s[after - 1], self.middle_s[after]
+        d0, d1 = self.middle_d[after - 1], self.middle_d[after]
+        return d0 + (d1 - d0) * (s - s0) / (s1 - s0)
+
     def forget(self, before: int) -> None:
         """Drop transitions that ended before a step."""
         old = bisect_left(self.steps, before)

@@ -43,6 +43,7 @@ class Problem:
     cars : (6, N, T), see reward.StageInputs.
     theta : (6,) weights of the reward terms.
     cohesion_weight, cohesion_target : (k, T), beta included; zero weights: not cohesive.
+    place_weight, place_target : (T,) per m², beta included, and m: where across the road.
     """
 
     ego: FloatArray
@@ -57,6 +58,8 @@ class Problem:
     theta: FloatArray
     cohesion_weight: FloatArray
     cohesion_target: FloatArray
+    place_weight: FloatArray
+    place_target: FloatArray
 
     def vector(self) -> FloatArray:
         """All parameters as one vector, each field in column-major order as CasADi has it."""
@@ -104,6 +107,8 @@ class Mpc:
             "theta": (len(RewardWeights.model_fields), 1),
             "cohesion_weight": (k, horizon),
             "cohesion_target": (k, horizon),
+            "place_weight": (1, horizon),
+            "place_target": (1, horizon),
         }
         p = {name: ca.SX.sym(name, *shape) for name, shape in shapes.items()}
         states = [ca.SX.sym(f"x{t}", 4) for t in range(horizon + 1)]
@@ -138,6 +143,7 @@ class Mpc:
             psi = ca.vertcat(*social_features(before, after, DT, curvature))
             missed = p["cohesion_target"][:, t] - psi
             cohesion -= ca.dot(p["cohesion_weight"][:, t], missed**2)
+            cohesion -= p["place_weight"][t] * (p["place_target"][t] - after[1]) ** 2
         unknowns.append(states[horizon])
 
         z, g, parameters = (

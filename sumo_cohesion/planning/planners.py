@@ -22,6 +22,8 @@ from sumo_cohesion.road import Road
 from sumo_cohesion.social.agreement import Agreement, agree, combine, elect_lateral
 from sumo_cohesion.social.features import FEATURES, social_features
 from sumo_cohesion.social.groups import group_votes
+from sumo_cohesion.social.place import NOWHERE, Place, agree_on_place
+from sumo_cohesion.social.place import SCALE as PLACE_SCALE
 from sumo_cohesion.social.settings import PAPER, CohesionSettings
 from sumo_cohesion.state import AgreementRow, Control, FloatArray, Observation, Plan
 
@@ -65,6 +67,8 @@ class CohesivePlanner:
         self.cohesion = cohesion
         self._theta = np.array(list(settings.reward.model_dump().values()))
         self._mpc: Mpc | None = None
+        # Where the horizon is asked for the others' place: every third step is dense enough.
+        self._place_steps = list(range(1, settings.horizon + 1, 3))
 
     def reset(self, road: Road) -> None:
         """Build the controller, once per number of lanes, and forget the last run."""
@@ -81,23 +85,33 @@ class CohesivePlanner:
         # 1. Who and what: the groups' social features (section III-D and III-B).
         # 2. When: their agreement, by sample variance (section III-C).
         start = perf_counter()
-        groups = self._agreement(observation, history) if self.cohesion.beta > 0.0 else ()
+        groups, place = self._agreement(observation, history)
         social_time = perf_counter() - start
         # 3. How: trade the ego's reward against cohesion (eq. 2) by MPC (section II-A).
         assert self._mpc is not None, "call reset(road) before plan()"
-        solution = self._mpc.solve(self._problem(observation, groups))
+        solution = self._mpc.solve(self._problem(observation, groups, place))
         # 4. Never without a plan: a failed solve brakes in lane.
-        plan = self._to_plan(observation, solution, groups)
+        plan = self._to_plan(observation, solution, groups, place)
         return replace(plan, social_time=social_time)
 
-    def _agreement(self, observation: Observation, history: History) -> tuple[Agreement, ...]:
-        votes = group_votes(observation.ego, history, self._road, self.cohesion)
-        groups = agree(votes, self.cohesion)
-        if self.cohesion.lateral_votes == "most_surprising":
-            groups = elect_lateral(groups)
-        return groups
+    def _agreement(
+        self, observation: Observation, history: History
+    ) -> tuple[tuple[Agreement, ...], Place]:
+        cohesion, road, ego = self.cohesion, self._road, observation.ego
+        if cohesion.beta == 0.0:
+            return (), NOWHERE
+        groups = agree(group_votes(ego, history, road, cohesion), cohesion)
+        place = NOWHERE
+        if cohesion.place_weight > 0.0:
+            ahead = [ego.s + 0.1 * ego.speed * t for t in self._place_steps]
+            place = agree_on_place(ego, history, road, ahead, cohesion)
+        if cohesion.lateral_votes == "most_surprising":
+            groups, place = elect_lateral(groups, place, cohesion.surprise)
+        return groups, place
 
-    def _problem(self, observation: Observation, groups: tuple[Agreement, ...]) -> Problem:
+    def _problem(
+        self, observation: Observation, groups: tuple[Agreement, ...], place: Place
+    ) -> Problem:
         from sumo_cohesion.planning.mpc import DT, FAR_AWAY, Problem
 
         horizon, road, ego = self.settings.horizon, self._road, observation.ego
@@ -114,6 +128,12 @@ class CohesivePlanner:
             term = combine(groups)
             weight[:, 0] = self.cohesion.beta * np.array(term.weight)
             target[:, 0] = term.target
+        place_weight, place_target = np.zeros((2, horizon))
+        if place.n:
+            stages = np.arange(1, horizon + 1)
+            place_weight = np.interp(stages, self._place_steps, place.weight)
+            place_weight *= self.cohesion.beta / PLACE_SCALE**2
+            place_target = np.interp(stages, self._place_steps, place.mean)
         return Problem(
             ego=np.array(ego),
             ego_width=np.array([observation.ego_size[1]]),
@@ -127,6 +147,8 @@ class CohesivePlanner:
             theta=self._theta,
             cohesion_weight=weight,
             cohesion_target=target,
+            place_weight=place_weight,
+            place_target=place_target,
         )
 
     def _predict_cars(self, observation: Observation, dt: float, far: float) -> FloatArray:
@@ -151,9 +173,13 @@ class CohesivePlanner:
         return cars
 
     def _to_plan(
-        self, observation: Observation, solution: Solution, groups: tuple[Agreement, ...]
+        self,
+        observation: Observation,
+        solution: Solution,
+        groups: tuple[Agreement, ...],
+        place: Place,
     ) -> Plan:
-        rows = explain(observation, groups, self.cohesion.beta, self._road)
+        rows = explain(observation, groups, place, self.cohesion.beta, self._road)
         if not solution.solved:
             return fallback(
                 observation,
@@ -176,7 +202,11 @@ class CohesivePlanner:
 
 
 def explain(
-    observation: Observation, groups: tuple[Agreement, ...], beta: float, road: Road
+    observation: Observation,
+    groups: tuple[Agreement, ...],
+    place: Place,
+    beta: float,
+    road: Road,
 ) -> tuple[AgreementRow, ...]:
     """Say per group and feature what was agreed and what ignoring it would cost."""
     if not groups:
@@ -191,13 +221,20 @@ def explain(
         speed,
     )
     own = social_features(observation.ego, on, dt, curvature)
-    return tuple(
-        [
-            AgreementRow(g.group, name, g.n, m, v, w, float(o), float(beta * w * (m - o) ** 2))
-            for g in groups
-            for name, m, v, w, o in zip(FEATURES, g.mean, g.variance, g.weight, own, strict=True)
-        ]
-    )
+    rows = [
+        AgreementRow(g.group, name, g.n, m, v, w, float(o), float(beta * w * (m - o) ** 2))
+        for g in groups
+        for name, m, v, w, o in zip(FEATURES, g.mean, g.variance, g.weight, own, strict=True)
+    ]
+    if place.n:
+        mean, variance, weight = place.mean[0] / PLACE_SCALE, place.variance[0], place.weight[0]
+        pull = beta * weight * (mean - d / PLACE_SCALE) ** 2
+        rows.append(
+            AgreementRow(
+                "position", "place", place.n, mean, variance, weight, d / PLACE_SCALE, pull
+            )
+        )
+    return tuple(rows)
 
 
 def fallback(

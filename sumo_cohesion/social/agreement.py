@@ -8,6 +8,7 @@ from typing import NamedTuple
 from sumo_cohesion.perception.history import Features
 from sumo_cohesion.social.features import FEATURES, LATERAL
 from sumo_cohesion.social.groups import Votes
+from sumo_cohesion.social.place import Place
 from sumo_cohesion.social.settings import CohesionSettings
 
 _ZEROS: Features = (0.0,) * len(FEATURES)
@@ -59,24 +60,26 @@ def _agree(group: str, votes: Sequence[Features], settings: CohesionSettings) ->
     return Agreement(group, n, mean, variance, weight)
 
 
-def elect_lateral(groups: Sequence[Agreement]) -> tuple[Agreement, ...]:
-    """Let only the most surprising group vote on lateral features.
+def elect_lateral(
+    groups: Sequence[Agreement], place: Place, threshold: float
+) -> tuple[tuple[Agreement, ...], Place]:
+    """Let only the most surprising group vote on lateral features, and none if nothing surprises.
 
     Once humans have finished a swerve they all drive straight, and their unanimous "straight"
     elsewhere would outvote the "turn" of those who pass the ego's own place. The ego keeps its
     lane by itself; so of all agreements the one that contradicts lane keeping most, with the
     largest sum of weight · mean², is the one that has something to say ("for only the subset
-    of cars that exhibits the low variance", paper, section I).
+    of cars that exhibits the low variance", paper, section I). The position group's place
+    counts with it.
     """
     surprise = [
         sum(w * m * m for w, m, lateral in zip(g.weight, g.mean, LATERAL, strict=True) if lateral)
+        + (place.surprise if g.group == "position" else 0.0)
         for g in groups
     ]
     most = max(surprise)
-    if most <= 1.0:
-        return tuple(groups)
-    chosen = surprise.index(most)
-    return tuple(
+    chosen = surprise.index(most) if most > threshold else -1
+    elected = tuple(
         [
             g
             if i == chosen
@@ -86,6 +89,9 @@ def elect_lateral(groups: Sequence[Agreement]) -> tuple[Agreement, ...]:
             for i, g in enumerate(groups)
         ]
     )
+    if chosen < 0 or groups[chosen].group != "position":
+        place = place._replace(weight=(0.0,) * len(place.weight))
+    return elected, place
 
 
 def combine(groups: Sequence[Agreement]) -> CohesionTerm:

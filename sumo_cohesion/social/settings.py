@@ -22,6 +22,10 @@ class CohesionSettings(BaseModel):
     min_cars : fewest cars that can agree; one car always agrees with itself.
     lateral_votes : "all": every group votes on lateral features, as in the paper's eq. 2;
         "most_surprising": only the group whose agreement contradicts lane keeping most.
+    surprise : lateral agreement counts only if it contradicts lane keeping by more than this
+        (largest sum of weight · mean²); what lane keeping does anyway is no news.
+    place_weight : weight of the lateral position at a place (social.place), relative to the
+        other features; zero switches it off.
     interval : seconds that a human's transition spans.
     memory : seconds that past transitions are remembered for the position group.
     position_length, position_width : half sizes (m) of the position group's box.
@@ -35,6 +39,8 @@ class CohesionSettings(BaseModel):
     variance_floor: Positive = 2.5e-3
     min_cars: Annotated[int, Field(ge=2)] = 2
     lateral_votes: Literal["all", "most_surprising"] = "most_surprising"
+    surprise: NonNegative = 5.0
+    place_weight: NonNegative = 1.0
     interval: Positive = 0.5
     memory: Positive = 20.0
     position_length: Positive = 8.0
@@ -45,6 +51,6 @@ class CohesionSettings(BaseModel):
 
 
 PAPER = CohesionSettings(
-    lateral_votes="all", interval=0.1, position_length=3.0, position_width=1.85
+    lateral_votes="all", place_weight=0.0, interval=0.1, position_length=3.0, position_width=1.85
 )
 """The paper's formula as printed: every group votes on every feature, one-step transitions."""

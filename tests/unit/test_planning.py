@@ -22,6 +22,7 @@ from sumo_cohesion.planning.planners import (
 from sumo_cohesion.planning.settings import PlannerSettings
 from sumo_cohesion.road import Road
 from sumo_cohesion.social.features import social_features
+from sumo_cohesion.social.place import NOWHERE
 from sumo_cohesion.social.settings import CohesionSettings
 from sumo_cohesion.state import Observation, RoadState
 
@@ -166,6 +167,26 @@ def test_cohesive_follows_a_swerve_that_nominal_ignores(highway: Road, side: flo
     assert strongest.group == "position"
 
 
+def test_a_lagging_ego_is_drawn_to_the_others_path(highway: Road) -> None:
+    # All drove straight, 1.6 m left of the lane's centre: every difference is zero, so only
+    # where they drove can tell the ego to move over.
+    history = empty_history()
+    for k in range(60):
+        cars = [(start + 2.5 * k, 1.6, 0.0, 25.0) for start in (270.0, 260.0, 250.0)]
+        scene = observation((300.0, 0.4, 0.0, 25.0), cars)
+        history.push(scene)
+    moved = {}
+    for weight in (0.0, 1.0):
+        planner = CohesivePlanner(SETTINGS, CohesionSettings(place_weight=weight, surprise=1.0))
+        planner.reset(highway)
+        plan = planner.plan(scene, history)
+        moved[weight] = plan.states[-1, 1] - 0.4
+    assert moved[0.0] < 0.0  # back to the lane's centre
+    assert moved[1.0] > 0.1
+    (row,) = [r for r in plan.agreement if r.feature == "place"]
+    assert (row.n, row.mean * 3.5) == pytest.approx((3, 1.6))
+
+
 def test_beta_zero_is_the_nominal_planner(highway: Road) -> None:
     scene, history = agreeing_history(1.0)
     planner = CohesivePlanner(SETTINGS, CohesionSettings(beta=0.0))
@@ -191,7 +212,7 @@ def test_a_problem_that_is_not_a_number_is_refused(highway: Road) -> None:
     planner = CohesivePlanner(SETTINGS, CohesionSettings())
     planner.reset(highway)
     scene = observation((100.0, 0.0, 0.0, 25.0), [])
-    problem = planner._problem(scene, ())
+    problem = planner._problem(scene, (), NOWHERE)
     assert planner._mpc is not None
     broken: Problem = replace(problem, ego=np.array([np.nan, 0.0, 0.0, 25.0]))
     solution = planner._mpc.solve(broken)

@@ -13,10 +13,11 @@ from sumo_cohesion.road import Road
 from sumo_cohesion.social.agreement import Agreement, agree, combine, elect_lateral
 from sumo_cohesion.social.features import FEATURES, SCALES, social_features
 from sumo_cohesion.social.groups import group_votes
+from sumo_cohesion.social.place import NOWHERE, agree_on_place
 from sumo_cohesion.social.settings import CohesionSettings
 from sumo_cohesion.state import Observation, RoadState
 
-SETTINGS = CohesionSettings()
+SETTINGS = CohesionSettings(place_weight=1.0)
 
 
 def observe(
@@ -184,10 +185,35 @@ def test_perfect_agreement_has_the_floors_weight() -> None:
 def test_only_the_most_surprising_group_steers_but_all_set_the_speed() -> None:
     turn = Agreement("position", 3, (1.0, 2.5, 0.5, 2.5, 1.0), (0.0,) * 5, (400.0,) * 5)
     straight = Agreement("road", 4, (0.0, 2.5, 0.0, 2.5, 0.0), (0.0,) * 5, (400.0,) * 5)
-    elected = elect_lateral((turn, straight))
-    assert elected[0].weight == (400.0,) * 5
-    assert elected[1].weight == (0.0, 400.0, 0.0, 400.0, 0.0)
-    assert elect_lateral((straight, straight)) == (straight, straight)
+    speed_only = (0.0, 400.0, 0.0, 400.0, 0.0)
+    elected, _ = elect_lateral((turn, straight), NOWHERE, threshold=1.0)
+    assert [g.weight for g in elected] == [turn.weight, speed_only]
+    # Driving straight is what lane keeping does anyway: it must not freeze an ego in between.
+    elected, _ = elect_lateral((straight, straight), NOWHERE, threshold=1.0)
+    assert [g.weight for g in elected] == [speed_only, speed_only]
+
+
+def test_a_place_off_the_lane_centre_is_news_and_one_on_it_is_not(highway: Road) -> None:
+    for d, expected in ((1.6, 400.0 * (1.6 / 3.5) ** 2), (0.0, 0.0)):
+        h = history()
+        drive(h, 60, {c: (s, d, 25.0, 0.0) for c, s in (("a", 270.0), ("b", 250.0))})
+        ego = RoadState(300.0, d, 0.0, 25.0)
+        place = agree_on_place(ego, h, highway, [302.5, 310.0, 900.0], SETTINGS)
+        assert place.n == 2
+        assert place.mean[:2] == pytest.approx((d, d))
+        assert place.weight == pytest.approx((400.0, 400.0, 0.0))
+        assert place.surprise == pytest.approx(expected)
+        straight = Agreement("position", 2, (0.0, 2.5, 0.0, 2.5, 0.0), (0.0,) * 5, (400.0,) * 5)
+        (group,), elected = elect_lateral((straight,), place, threshold=1.0)
+        assert (group.weight == straight.weight) is (d > 0)
+        assert (elected == place) is (d > 0)
+
+
+def test_cars_that_passed_far_aside_do_not_vote_on_the_place(highway: Road) -> None:
+    h = history()
+    drive(h, 60, {c: (s, 7.0, 25.0, 0.0) for c, s in (("a", 270.0), ("b", 250.0))})
+    place = agree_on_place(RoadState(300.0, 0.0, 0.0, 25.0), h, highway, [302.5], SETTINGS)
+    assert (place.n, place.weight, place.surprise) == (0, (0.0,), 0.0)
 
 
 def test_combined_term_differs_from_the_groups_sum_by_a_constant() -> None:
