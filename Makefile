@@ -5,7 +5,7 @@ NETCONVERT := $(BIN)/netconvert --offset.disable-normalization true --no-turnaro
 # Threads of the linear algebra library only cost time here: the matrices are tiny.
 export OPENBLAS_NUM_THREADS := 1
 
-.PHONY: demo test lint check format networks docs lock wheel benchmark clean
+.PHONY: demo test lint check format networks docs lock wheel benchmark evidence clean
 
 demo: $(VENV)/.installed
 	$(BIN)/sumo-cohesion compare stalled --seeds 0:10 --out demo
@@ -43,6 +43,9 @@ docs: $(VENV)/.installed
 lock: $(VENV)/.installed
 	$(BIN)/uv pip compile pyproject.toml --all-extras --universal --no-annotate --no-header \
 	  --no-emit-index-url --no-emit-find-links --python-version 3.11 -o requirements.lock
+
+evidence: $(VENV)/.installed
+	$(BIN)/python analysis/stalled.py
 
 benchmark: $(VENV)/.installed
 	$(BIN)/python benchmarks/rooms.py

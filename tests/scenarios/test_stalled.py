@@ -193,3 +193,30 @@ def test_public_names_exist() -> None:
         assert getattr(sumo_cohesion, name) is not None
     with pytest.raises(AttributeError, match="nothing"):
         _ = sumo_cohesion.nothing  # type: ignore[attr-defined]
+
+
+class Dying(Straight):
+    """A user's planner that takes its process with it."""
+
+    def plan(self, observation: object, history: object) -> object:
+        """End the process, as a segmentation fault would."""
+        import os
+
+        os._exit(1)
+
+
+def test_a_dead_worker_is_one_line_and_finished_runs_are_kept(tmp_path: Path) -> None:
+    with pytest.raises(sumo_cohesion.SimulationError, match="worker process died") as error:
+        compare(
+            "stalled",
+            ("sumo", "tests.scenarios.test_stalled:Dying"),
+            (0, 1),
+            workers=1,
+            overrides={"duration": 1.0},
+            out=tmp_path / "result",
+        )
+    assert "\n" not in str(error.value)
+    assert not (tmp_path / "result").exists()
+    kept = load_metrics(tmp_path / "result.unfinished")
+    assert kept["seed"].tolist() == [0, 1]
+    assert (kept["planner"] == "sumo").all()
