@@ -32,7 +32,7 @@ CASES = {
 
 
 def summarize_case(case: str, runs: pd.DataFrame) -> list[dict[str, object]]:
-    """Counts and Wilson intervals per planner."""
+    """Count outcomes per planner, with Wilson intervals."""
     rows: list[dict[str, object]] = []
     for planner, group in runs.groupby("planner", sort=False):
         n, collisions = len(group), int(group["collision"].sum())

@@ -40,10 +40,11 @@ def run_metrics(
         "collision_visible": bool(set(touched) - set(info["hidden"])),
         "sumo_collision": bool(info["touched_by_sumo"]),
         "off_road": off_road(ego, plan),
-        "exited": bool(ego["lane"].iloc[-1] >= info["n_route_lanes"]),
+        "exited": bool(plan["on_exit"].any()),
         "distance": distance,
         "travel_time": float(end - start),
         "mean_speed": distance / float(end - start),
+        "speed_gap_closed": speed_gap_closed(ego, others, plan),
         "lane_changes": int((np.diff(ego["lane"]) != 0).sum()),
         **gap_metrics(ego, others),
         "pet": post_encroachment_time(ego, others),
@@ -81,6 +82,24 @@ def off_road(ego: pd.DataFrame, plan: pd.DataFrame) -> bool:
     half = ego["width"].to_numpy()[: len(plan)] / 2
     beyond = (d - half < plan["road_right"]) | (d + half > plan["road_left"])
     return bool(beyond.any())
+
+
+def speed_gap_closed(ego: pd.DataFrame, others: pd.DataFrame, plan: pd.DataFrame) -> float:
+    """Share of the gap between the limit and the others' speed that the ego closed.
+
+    (ego - limit) / (others - limit), of means over 5 s to 15 s after the start, when the ego has
+    had time to adapt and the others are still near; others are those it sees within 80 m. NaN
+    if they differ from the limit by less than 0.5 m/s, or there are none.
+    """
+    start = float(ego["time"].iloc[0])
+    own = ego[ego["time"].between(start + 5.0, start + 15.0)]
+    near = others[others["visible"]].merge(own[["time", "s"]], on="time", suffixes=("", "_ego"))
+    near = near[(near["s"] - near["s_ego"]).abs() <= 80.0]
+    if near.empty:
+        return np.nan
+    limit = float(plan["speed_limit"][plan["time"].isin(own["time"])].mean())
+    gap = float(near["speed"].mean()) - limit
+    return float((own["speed"].mean() - limit) / gap) if abs(gap) >= 0.5 else np.nan
 
 
 def gap_metrics(ego: pd.DataFrame, others: pd.DataFrame) -> dict[str, float]:

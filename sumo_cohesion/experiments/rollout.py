@@ -19,7 +19,7 @@ from sumo_cohesion.errors import UserError
 from sumo_cohesion.experiments.columns import as_table
 from sumo_cohesion.experiments.metrics import run_metrics
 from sumo_cohesion.road import Road
-from sumo_cohesion.state import Control, Observation, Plan, RoadState, Scene
+from sumo_cohesion.state import BoolArray, Control, FloatArray, Observation, Plan, RoadState, Scene
 from sumo_cohesion.traffic.demand import EGO
 
 if TYPE_CHECKING:
@@ -198,7 +198,8 @@ class Recorder:
     def _plan_table(self) -> pd.DataFrame:
         ego = np.array([state for _, state, _ in self._plans])
         right, left = self._road.drivable_at(ego[:, 0], ego[:, 1])
-        on_exit = self._road.lane_index(ego[:, 0], ego[:, 1]) >= self._road.n_route_lanes
+        limit = self._road.speed_limit_at(ego[:, 0])
+        on_exit = self._on_exit(ego)
         rows = []
         for i, (time, _, plan) in enumerate(self._plans):
             control = plan.controls[0] if plan.controls else _NO_CONTROL
@@ -212,10 +213,21 @@ class Recorder:
                 "road_right": right[i],
                 "road_left": left[i],
                 "on_exit": on_exit[i],
+                "speed_limit": limit[i],
             }
             row.update({f"reward_{name}": value for name, value in plan.reward.items()})
             rows.append(row)
         return as_table("plan", rows)
+
+    def _on_exit(self, ego: FloatArray) -> BoolArray:
+        """Tell when the ego, (n, 4) road states, is on an exit that has parted from its route.
+
+        By geometry: SUMO's lane id stays that of the route for a while after the gore.
+        """
+        nearest = self._road.lane_index(ego[:, 0], ego[:, 1])
+        lanes = self._road.lanes_at(ego[:, 0])[:, : self._road.n_route_lanes]
+        away = np.nanmin(np.abs(lanes - ego[:, 1:2]), axis=1)
+        return np.asarray((nearest >= self._road.n_route_lanes) & (away > 3.5))
 
     def _agreement_table(self) -> pd.DataFrame:
         rows: list[dict[str, object]] = [
