@@ -45,12 +45,15 @@ def run_metrics(
         "travel_time": float(end - start),
         "mean_speed": distance / float(end - start),
         "speed_gap_closed": speed_gap_closed(ego, others, plan),
+        **emergency_metrics(info, ego, others),
+        "max_lateral_shift": float((ego["d"] - ego["d"].iloc[0]).abs().max()),
+        "max_speed_shift": max_speed_shift(ego, plan),
         "lane_changes": int((np.diff(ego["lane"]) != 0).sum()),
         **gap_metrics(ego, others),
         "pet": post_encroachment_time(ego, others),
         "max_jerk": max_jerk(ego),
         "max_lateral_acceleration": max_lateral_acceleration(ego),
-        **human_metrics(others, info["hidden"]),
+        **human_metrics(others, [*info["hidden"], *info["special"]]),
         "plan_failures": int(plan["fallback"].sum()),
         "plan_ms_median": float(timing["plan_ms"].median()),
         "plan_ms_p99": float(timing["plan_ms"].quantile(0.99)),
@@ -100,6 +103,41 @@ def speed_gap_closed(ego: pd.DataFrame, others: pd.DataFrame, plan: pd.DataFrame
     limit = float(plan["speed_limit"][plan["time"].isin(own["time"])].mean())
     gap = float(near["speed"].mean()) - limit
     return float((own["speed"].mean() - limit) / gap) if abs(gap) >= 0.5 else np.nan
+
+
+def max_speed_shift(ego: pd.DataFrame, plan: pd.DataFrame) -> float:
+    """Largest difference (m/s) between the ego's speed and the limit of its route."""
+    speed = ego["speed"].to_numpy()[: len(plan)]
+    return float(np.abs(speed - plan["speed_limit"].to_numpy()).max())
+
+
+def emergency_metrics(
+    info: Mapping[str, Any], ego: pd.DataFrame, others: pd.DataFrame
+) -> dict[str, float]:
+    """How long the special vehicle was held up, and how soon the ego made way.
+
+    emergency_delay: from the scenario's first ``near`` event to the end of the run, the time
+    (s) that the special vehicle lost against driving at the fastest speed it ever had. yield_time:
+    seconds from that event until the ego was half a lane (1.75 m) right of where it was. NaN
+    where there is no special vehicle or event, or the ego never moved over.
+    """
+    nothing = {"emergency_delay": np.nan, "yield_time": np.nan}
+    numbers = [i for i, e in enumerate(info["scenario"]["events"]) if e["near"] is not None]
+    if not info["special"] or not numbers or str(numbers[0]) not in info["events"]:
+        return nothing
+    event = float(info["events"][str(numbers[0])])
+    vehicle = others[others["vehicle"] == info["special"][0]]
+    after = vehicle[vehicle["time"] >= event]
+    if len(after) < 2:
+        return nothing
+    passed = float(after["time"].iloc[-1] - after["time"].iloc[0])
+    driven = float(after["s"].iloc[-1] - after["s"].iloc[0])
+    own = ego[ego["time"] >= event]
+    aside = own[own["d"] < own["d"].iloc[0] - 1.75]
+    return {
+        "emergency_delay": passed - driven / float(vehicle["speed"].max()),
+        "yield_time": float(aside["time"].iloc[0] - event) if len(aside) else np.nan,
+    }
 
 
 def gap_metrics(ego: pd.DataFrame, others: pd.DataFrame) -> dict[str, float]:
@@ -176,9 +214,9 @@ def _peak(values: FloatArray) -> float:
     return float(np.abs(values).max()) if values.size else 0.0
 
 
-def human_metrics(others: pd.DataFrame, hidden: list[str]) -> dict[str, float]:
+def human_metrics(others: pd.DataFrame, not_human: list[str]) -> dict[str, float]:
     """Mean speed of the humans near the ego, and how often one began to brake hard."""
-    humans = others[~others["vehicle"].isin(hidden)]
+    humans = others[~others["vehicle"].isin(not_human)]
     moved = humans.groupby("vehicle")["speed"].transform("max") > 0.1
     humans = humans[moved]
     brakes = 0

@@ -10,7 +10,7 @@ import tempfile
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -111,6 +111,19 @@ def versions() -> dict[str, str]:
     return {"python": platform.python_version()} | {name: version(name) for name in packages}
 
 
+class Ending(NamedTuple):
+    """How a run ended.
+
+    ``touched`` are the vehicles the ego touched, ``touched_by_sumo`` those SUMO reports;
+    ``triggered`` is SUMO's time (s) of each of the scenario's events, by number.
+    """
+
+    outcome: str
+    touched: list[str]
+    touched_by_sumo: list[str]
+    triggered: dict[int, float]
+
+
 class Recorder:
     """Collects the steps of one run and turns them into tables at its end."""
 
@@ -139,9 +152,7 @@ class Recorder:
         self,
         setup: Setup,
         last: Scene,
-        outcome: str,
-        touched: list[str],
-        reported: list[str],
+        ending: Ending,
     ) -> Rollout:
         """Build the rollout; ``last`` is the scene after the last step."""
         self._scenes.append(last)
@@ -154,10 +165,12 @@ class Recorder:
             "settings": setup.settings.model_dump(mode="json"),
             "cohesion": setup.cohesion.model_dump(mode="json"),
             "seed": setup.seed,
-            "outcome": outcome,
-            "touched": touched,
-            "touched_by_sumo": reported,
+            "outcome": ending.outcome,
+            "touched": ending.touched,
+            "touched_by_sumo": ending.touched_by_sumo,
+            "events": {str(number): time for number, time in ending.triggered.items()},
             "hidden": list(setup.scenario.sensing.hidden),
+            "special": list(setup.scenario.sensing.special),
             "n_route_lanes": setup.road.n_route_lanes,
             "versions": versions(),
         }

@@ -15,6 +15,7 @@ from sumo_cohesion.experiments.columns import METRICS
 from sumo_cohesion.planning.settings import PlannerSettings
 from sumo_cohesion.social.settings import CohesionSettings
 from sumo_cohesion.traffic.demand import EgoDemand, Randomization
+from sumo_cohesion.traffic.drivers import Event
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
@@ -60,6 +61,7 @@ class Scenario(_Data):
         bundled ones.
     duration : seconds after the ego's departure.
     lateral_resolution : width (m) of SUMO's sublanes.
+    events : what humans are told, and when, where SUMO has no such rule.
     success : each key a metric, each value what it must be: a value or {min, max}.
     """
 
@@ -73,6 +75,7 @@ class Scenario(_Data):
     ego: EgoDemand
     sensing: Sensing = Sensing()
     randomize: Randomization = Randomization()
+    events: tuple[Event, ...] = ()
     success: dict[str, bool | float | Bounds]
     _folder: Path = PrivateAttr(default=Path())
 

@@ -11,7 +11,7 @@ from time import perf_counter
 from typing import Any
 
 from sumo_cohesion.errors import UserError
-from sumo_cohesion.experiments.rollout import Recorder, Rollout
+from sumo_cohesion.experiments.rollout import Ending, Recorder, Rollout
 from sumo_cohesion.experiments.scenario import Scenario, load_scenario, settings_from
 from sumo_cohesion.perception.history import History
 from sumo_cohesion.perception.observation import Sensor
@@ -24,6 +24,7 @@ from sumo_cohesion.social.settings import CohesionSettings
 from sumo_cohesion.state import CartesianState, Observation, Plan, Scene
 from sumo_cohesion.traffic.contact import contacts
 from sumo_cohesion.traffic.demand import build_demand, check_demand, write_demand
+from sumo_cohesion.traffic.drivers import Drivers
 from sumo_cohesion.traffic.network import Network
 from sumo_cohesion.traffic.simulator import STEP_LENGTH, Simulator, SumoRun
 
@@ -86,6 +87,8 @@ def prepare(
     additional = tuple(loaded.file(name, "routes") for name in loaded.additional)
     network = Network(network_file)
     named = {*loaded.sensing.hidden, *loaded.sensing.special}
+    for event in loaded.events:
+        named |= {*event.who} | ({event.near} if event.near else set())
     route = check_demand(network, routes, loaded.ego, named)
     return Setup(
         scenario=loaded,
@@ -153,6 +156,8 @@ def simulate(setup: Setup, planner: Planner, *, gui: bool = False) -> Rollout:
         Simulator(setup.write_inputs(Path(folder), gui), size, sensing.range + 50.0) as sumo,
     ):
         scene = sumo.insert_ego(latest=scenario.ego.depart + 60.0)
+        fixed = {*sensing.hidden, *sensing.special}
+        drivers = Drivers(scenario.events, fixed, setup.seed, scene.time)
         end, outcome, drives = scene.time + scenario.duration, "", False
         while not outcome:
             t0 = perf_counter()
@@ -165,6 +170,7 @@ def simulate(setup: Setup, planner: Planner, *, gui: bool = False) -> Rollout:
             if ego is not None and not drives:
                 sumo.take_over()
                 drives = True
+            drivers.act(scene.time, sumo)
             sumo.step(ego)
             following = sumo.read()
             t3 = perf_counter()
@@ -178,7 +184,8 @@ def simulate(setup: Setup, planner: Planner, *, gui: bool = False) -> Rollout:
             elif scene.time > end - STEP_LENGTH / 2:
                 outcome = "finished"
         names = [scene.ids[i] for i in touched]
-        return recorder.finish(setup, scene, outcome, names, sumo.reported_contacts())
+        ended = Ending(outcome, names, sumo.reported_contacts(), drivers.triggered)
+        return recorder.finish(setup, scene, ended)
 
 
 def _plan(planner: Planner, observation: Observation, history: History, setup: Setup) -> Plan:

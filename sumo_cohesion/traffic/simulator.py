@@ -13,7 +13,7 @@ import sys
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
-from math import cos, degrees, hypot, isfinite, pi, radians, sin
+from math import cos, degrees, hypot, inf, isfinite, pi, radians, sin
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -227,6 +227,33 @@ class Simulator:
         """Vehicles that SUMO itself says the ego touched in the last step."""
         pairs = [(c.collider, c.victim) for c in self._sumo.simulation.getCollisions()]
         return sorted({a if b == EGO else b for a, b in pairs if EGO in (a, b)})
+
+    def vehicles(self) -> list[str]:
+        """Ids of all vehicles on the road, the ego's excluded."""
+        return [name for name in self._sumo.vehicle.getIDList() if name != EGO]
+
+    def distance_to_ego(self, vehicle: str) -> float:
+        """Metres between a vehicle and the ego; infinite if it is not there."""
+        if vehicle not in self._sumo.vehicle.getIDList():
+            return inf
+        ego, other = (self._sumo.vehicle.getPosition(name) for name in (EGO, vehicle))
+        return hypot(ego[0] - other[0], ego[1] - other[1])
+
+    def order_lane(self, vehicle: str, lane: int, seconds: float) -> None:
+        """Let a human change to a lane when SUMO finds it safe, trying for so many seconds."""
+        self._sumo.vehicle.changeLane(vehicle, lane, seconds)
+
+    def order_sublane(self, vehicle: str, metres: float) -> None:
+        """Let a human move aside by so much; left is positive."""
+        self._sumo.vehicle.changeSublane(vehicle, metres)
+
+    def order_speed_factor(self, vehicle: str, factor: float) -> None:
+        """Give a human another desired speed, as a share of the limit."""
+        self._sumo.vehicle.setSpeedFactor(vehicle, factor)
+
+    def order_keep_lane(self, vehicle: str) -> None:
+        """Switch off a vehicle's own lane changes."""
+        self._sumo.vehicle.setLaneChangeMode(vehicle, 0)
 
     def _step(self) -> None:
         try:

@@ -138,3 +138,32 @@ def test_summary_counts_only_runs_where_the_metric_is_defined() -> None:
     assert summary.loc["success", "value"] == 0.5
     assert summary.loc["min_ttc", "n"] == 1
     assert summary.loc["min_gap", "n"] == 2
+
+
+def test_emergency_delay_and_yield_time_by_hand() -> None:
+    # 33 m/s for 2 s, then held up at 25 m/s for 3 s: 3 · (1 - 25/33) s lost.
+    s = np.where(TIME <= 2.0, 33.0 * TIME, 66.0 + 25.0 * (TIME - 2.0))
+    ambulance = car("ambulance", s)
+    ambulance["speed"] = np.where(TIME <= 2.0, 33.0, 25.0)
+    ego = car("ego", 200.0 + 25.0 * TIME)
+    ego["d"] = np.where(TIME < 4.0, 7.0, 5.0)
+    info = {
+        "scenario": {"events": [{"near": None}, {"near": "ambulance"}]},
+        "special": ["ambulance"],
+        "events": {"1": 1.0},
+    }
+    result = metrics.emergency_metrics(info, ego, ambulance)
+    assert result["emergency_delay"] == pytest.approx(3 * (1 - 25 / 33))
+    assert result["yield_time"] == pytest.approx(3.0)
+    nothing = metrics.emergency_metrics({**info, "events": {}}, ego, ambulance)
+    assert all(np.isnan(v) for v in nothing.values())
+
+
+def test_speed_gap_closed_by_hand() -> None:
+    time = np.round(0.1 * np.arange(201), 6)
+    ego, other = car("ego", 26.5 * time), car("a", 30.0 + 27.5 * time)
+    other["visible"] = True
+    plan = pd.DataFrame({"time": time, "speed_limit": 25.0})
+    assert metrics.speed_gap_closed(ego, other, plan) == pytest.approx(0.6)
+    other["visible"] = False
+    assert np.isnan(metrics.speed_gap_closed(ego, other, plan))
