@@ -16,7 +16,7 @@ from sumo_cohesion.experiments.scenario import Scenario, load_scenario, settings
 from sumo_cohesion.perception.history import History
 from sumo_cohesion.perception.observation import Sensor
 from sumo_cohesion.planning import dynamics
-from sumo_cohesion.planning.planners import Planner, fallback, make_planner
+from sumo_cohesion.planning.planners import Planner, cohesion_of, fallback, make_planner
 from sumo_cohesion.planning.settings import PlannerSettings
 from sumo_cohesion.road import Road
 from sumo_cohesion.social.features import social_features
@@ -47,12 +47,16 @@ class Setup:
     route: tuple[str, ...]
     road: Road
 
+    @property
+    def not_human(self) -> set[str]:
+        """Vehicles that the scenario hides or calls special: a stalled car, an ambulance."""
+        return {*self.scenario.sensing.hidden, *self.scenario.sensing.special}
+
     def write_inputs(self, folder: Path, gui: bool = False) -> SumoRun:
         """Write this seed's demand and return what SUMO needs."""
         scenario = self.scenario
-        fixed = {*scenario.sensing.hidden, *scenario.sensing.special}
         demand = build_demand(
-            self.routes, self.route, scenario.ego, scenario.randomize, fixed, self.seed
+            self.routes, self.route, scenario.ego, scenario.randomize, self.not_human, self.seed
         )
         return SumoRun(
             network=self.network,
@@ -94,7 +98,7 @@ def prepare(
         scenario=loaded,
         planner_name=planner,
         settings=settings,
-        cohesion=cohesion,
+        cohesion=cohesion_of(planner, cohesion),
         seed=seed,
         network=network_file,
         routes=routes,
@@ -146,19 +150,18 @@ def simulate(setup: Setup, planner: Planner, *, gui: bool = False) -> Rollout:
     """Run the loop: observe, remember, plan, drive, step SUMO; until contact or the end."""
     scenario, road = setup.scenario, setup.road
     sensing, size = scenario.sensing, (scenario.ego.length, scenario.ego.width)
-    sensor = Sensor(road, sensing.range, set(sensing.hidden), set(sensing.special))
+    sensor = Sensor(road, sensing.range, sensing.hidden, sensing.special)
     memory = setup.cohesion.interval, setup.cohesion.memory
     history = History(STEP_LENGTH, *memory, describe=social_features)
-    recorder = Recorder(setup.road, size)
+    recorder = Recorder(road, size)
     planner.reset(road)
     with (
         tempfile.TemporaryDirectory() as folder,
         Simulator(setup.write_inputs(Path(folder), gui), size, sensing.range + 50.0) as sumo,
     ):
         scene = sumo.insert_ego(latest=scenario.ego.depart + 60.0)
-        fixed = {*sensing.hidden, *sensing.special}
-        drivers = Drivers(scenario.events, fixed, setup.seed, scene.time)
-        end, outcome, drives = scene.time + scenario.duration, "", False
+        drivers = Drivers(scenario.events, setup.not_human, setup.seed, scene.time)
+        end, outcome = scene.time + scenario.duration, ""
         while not outcome:
             t0 = perf_counter()
             observation = sensor.observe(scene)
@@ -167,9 +170,6 @@ def simulate(setup: Setup, planner: Planner, *, gui: bool = False) -> Rollout:
             plan = _plan(planner, observation, history, setup)
             t2 = perf_counter()
             ego = _drive(scene, plan, setup.settings)
-            if ego is not None and not drives:
-                sumo.take_over()
-                drives = True
             drivers.act(scene.time, sumo)
             sumo.step(ego)
             following = sumo.read()

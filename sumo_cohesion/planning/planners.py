@@ -24,7 +24,7 @@ from sumo_cohesion.social.features import FEATURES, social_features
 from sumo_cohesion.social.groups import group_votes
 from sumo_cohesion.social.place import NOWHERE, Place, agree_on_place
 from sumo_cohesion.social.place import SCALE as PLACE_SCALE
-from sumo_cohesion.social.settings import PAPER, CohesionSettings
+from sumo_cohesion.social.settings import CohesionSettings, as_printed
 from sumo_cohesion.state import AgreementRow, Control, FloatArray, Observation, Plan
 
 if TYPE_CHECKING:
@@ -275,6 +275,13 @@ BUILT_IN = {
 }
 
 
+def cohesion_of(name: str, cohesion: CohesionSettings) -> CohesionSettings:
+    """Return the cohesion settings that the planner of this name really uses."""
+    if name == "nominal":
+        return cohesion.model_copy(update={"beta": 0.0})
+    return as_printed(cohesion) if name == "paper" else cohesion
+
+
 def make_planner(name: str, settings: PlannerSettings, cohesion: CohesionSettings) -> Planner:
     """Make a planner by name: a built-in one, or ``module:Class`` called without arguments.
 
@@ -285,13 +292,8 @@ def make_planner(name: str, settings: PlannerSettings, cohesion: CohesionSetting
     """
     if name == "sumo":
         return SumoDriver()
-    if name == "nominal":
-        return CohesivePlanner(settings, cohesion.model_copy(update={"beta": 0.0}))
-    if name == "cohesive":
-        return CohesivePlanner(settings, cohesion)
-    if name == "paper":
-        printed = PAPER.model_copy(update={"beta": cohesion.beta})
-        return CohesivePlanner(settings, printed)
+    if name in BUILT_IN:
+        return CohesivePlanner(settings, cohesion_of(name, cohesion))
     return _load_planner(name)
 
 

@@ -50,7 +50,16 @@ class CohesionSettings(BaseModel):
     road_reach: Positive = 60.0
 
 
-PAPER = CohesionSettings(
-    lateral_votes="all", place_weight=0.0, interval=0.1, position_length=3.0, position_width=1.85
-)
-"""The paper's formula as printed: every group votes on every feature, one-step transitions."""
+def as_printed(cohesion: CohesionSettings) -> CohesionSettings:
+    """Return the paper's formula as printed (eq. 2), with the given beta, floor and reaches.
+
+    Every group votes on every feature, transitions span one step, nothing is added.
+    """
+    printed = {
+        "lateral_votes": "all",
+        "place_weight": 0.0,
+        "interval": 0.1,
+        "position_length": 3.0,
+        "position_width": 1.85,
+    }
+    return cohesion.model_copy(update=printed)

@@ -102,6 +102,7 @@ class Simulator:
         self._sizes: dict[str, tuple[float, float]] = {}
         self._driven: CartesianState | None = None
         self._stepped = True
+        self._taken_over = False
         self._sumo: Any = None
         self._variables: tuple[int, ...] = ()
 
@@ -161,7 +162,7 @@ class Simulator:
         )
         return self.read()
 
-    def take_over(self) -> None:
+    def _take_over(self) -> None:
         """Switch off SUMO's own control of the ego.
 
         A high speed factor matters: SUMO reports an ego moved faster than its lane's limit
@@ -173,12 +174,15 @@ class Simulator:
         vehicle.setSpeedFactor(EGO, 3.0)
         vehicle.setSpeedMode(EGO, 0)
         vehicle.setLaneChangeMode(EGO, 0)
+        self._taken_over = True
 
     def step(self, ego: CartesianState | None) -> None:
         """Advance SUMO by one step, with the ego at the given state (None: SUMO drives it)."""
         if ego is not None:
             if not all(map(isfinite, ego)):
                 raise SimulationError(f"the ego would be moved to a place that is no number: {ego}")
+            if not self._taken_over:
+                self._take_over()
             # SUMO's angles are degrees clockwise from north; its positions are front bumpers.
             half = self._ego_size[0] / 2
             front = ego.x + half * cos(ego.heading), ego.y + half * sin(ego.heading)

@@ -58,7 +58,6 @@ def test_scene_is_metric_centred_and_counter_clockwise(tmp_path: Path) -> None:
 def test_the_ego_is_where_it_was_put_at_the_speed_it_was_driven(tmp_path: Path) -> None:
     with simulation(tmp_path, vehicle("ego", 1, 100, 25), vehicle("b", 2, 160, 20)) as sumo:
         ego = sumo.insert_ego(latest=5.0).ego
-        sumo.take_over()
         reported = []
         for k in range(200):
             # Faster than any limit, weaving across the lanes, then a dead stop.
@@ -81,7 +80,6 @@ def test_the_ego_is_where_it_was_put_at_the_speed_it_was_driven(tmp_path: Path) 
 def test_an_ego_beside_the_road_is_still_where_it_was_put(tmp_path: Path) -> None:
     with simulation(tmp_path, vehicle("ego", 1, 100, 25), vehicle("b", 2, 160, 20)) as sumo:
         ego = sumo.insert_ego(latest=5.0).ego
-        sumo.take_over()
         for k in range(100):
             ego = CartesianState(ego.x + 2.5, -5.25 + 0.3 * k, 0.1, 25.0)
             sumo.step(ego)
@@ -147,7 +145,6 @@ def test_constructed_contacts_are_found_in_sumo(
         tmp_path, vehicle("ego", 0, 140, 15), vehicle("s", 0, 200, 0, stop=True)
     ) as sumo:
         scene = sumo.insert_ego(latest=5.0)
-        sumo.take_over()
         for k in range(60):
             sumo.step(path(0.1 * k))
             scene = sumo.read()
@@ -165,7 +162,6 @@ def test_own_contacts_agree_with_sumo_in_the_same_lane(tmp_path: Path) -> None:
         tmp_path, vehicle("ego", 0, 140, 15), vehicle("s", 0, 200, 0, stop=True)
     ) as sumo:
         sumo.insert_ego(latest=5.0)
-        sumo.take_over()
         for k in range(60):
             sumo.step(approach(0.0)(0.1 * k))
             scene = sumo.read()

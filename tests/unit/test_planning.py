@@ -242,6 +242,7 @@ def test_planners_by_name() -> None:
     paper = make_planner("paper", SETTINGS, CohesionSettings())
     assert isinstance(paper, CohesivePlanner)
     assert paper.cohesion.lateral_votes == "all"
+    assert paper.cohesion.interval == 0.1
 
 
 @pytest.mark.parametrize(
