@@ -8,9 +8,14 @@ from pathlib import Path
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import pytest
+from hypothesis import settings
 
 from sumo_cohesion.road import Road
 from sumo_cohesion.traffic.network import Network
+
+# A busy machine is no failure.
+settings.register_profile("any_machine", deadline=None)
+settings.load_profile("any_machine")
 
 ROOT = Path(__file__).resolve().parent.parent
 NETWORKS = ROOT / "tests" / "networks"

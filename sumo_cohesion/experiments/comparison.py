@@ -18,7 +18,8 @@ import pandas as pd
 
 from sumo_cohesion.errors import SimulationError, UserError
 from sumo_cohesion.experiments.rollout import RUN_FILE, Rollout, whole_folder
-from sumo_cohesion.experiments.simulation import prepare, simulate
+from sumo_cohesion.experiments.setup import prepare
+from sumo_cohesion.experiments.simulation import simulate
 from sumo_cohesion.experiments.statistics import summarize
 from sumo_cohesion.planning.planners import Planner, make_planner
 from sumo_cohesion.planning.settings import PlannerSettings

@@ -9,7 +9,7 @@ from typing import Any
 
 from sumo_cohesion.errors import UserError
 from sumo_cohesion.experiments.rollout import whole_folder
-from sumo_cohesion.experiments.simulation import prepare
+from sumo_cohesion.experiments.setup import prepare
 
 CONFIG_FILE = "scenario.sumocfg"
 

@@ -23,7 +23,7 @@ from sumo_cohesion.state import BoolArray, Control, FloatArray, Observation, Pla
 from sumo_cohesion.traffic.demand import EGO
 
 if TYPE_CHECKING:
-    from sumo_cohesion.experiments.simulation import Setup
+    from sumo_cohesion.experiments.setup import Setup
 
 RUN_FILE = "run.json"
 _NO_CONTROL = Control(float("nan"), float("nan"))

@@ -17,6 +17,7 @@ import numpy as np
 
 from sumo_cohesion.errors import UserError
 from sumo_cohesion.perception.history import History
+from sumo_cohesion.planning.fallback import fallback
 from sumo_cohesion.planning.settings import PlannerSettings
 from sumo_cohesion.road import Road
 from sumo_cohesion.social.agreement import Agreement, agree, combine, elect_lateral
@@ -29,9 +30,6 @@ from sumo_cohesion.state import AgreementRow, Control, FloatArray, Observation, 
 
 if TYPE_CHECKING:
     from sumo_cohesion.planning.mpc import Mpc, Problem, Solution
-
-FALLBACK_BRAKING = 4.0
-"""m/s², braking of the fallback plan."""
 
 
 @runtime_checkable
@@ -235,36 +233,6 @@ def explain(
             )
         )
     return tuple(rows)
-
-
-def fallback(
-    observation: Observation,
-    road: Road,
-    settings: PlannerSettings,
-    status: str,
-    iterations: int = 0,
-    wall_time: float = 0.0,
-    agreement_rows: tuple[AgreementRow, ...] = (),
-) -> Plan:
-    """Plan without a solver: brake in the lane the ego is in."""
-    ego = observation.ego
-    centre = float(road.lanes_at(ego.s)[road.lane_index(ego.s, ego.d)])
-    # Steer so that heading and offset from the lane's centre decay within about a second.
-    reach = max(0.7 * ego.speed, 5.0)
-    bend = -2.0 * ego.heading / reach - (ego.d - centre) / reach**2
-    curvature = float(road.curvature_at(ego.s)) + bend
-    curvature = float(np.clip(curvature, -settings.max_curvature, settings.max_curvature))
-    braking = min(FALLBACK_BRAKING, ego.speed / 0.1)
-    control = Control(curvature, settings.friction * ego.speed - braking)
-    return Plan(
-        controls=(control,),
-        states=np.array([ego]),
-        status=status,
-        fallback=True,
-        iterations=iterations,
-        wall_time=wall_time,
-        agreement=agreement_rows,
-    )
 
 
 BUILT_IN = {

@@ -7,11 +7,6 @@ moveToXY: https://sumo.dlr.de/docs/TraCI/Change_Vehicle_State.html#move_to_xy_0x
 from __future__ import annotations
 
 import contextlib
-import os
-import shutil
-import sys
-import tempfile
-from collections.abc import Iterator
 from dataclasses import dataclass
 from math import cos, degrees, hypot, inf, isfinite, pi, radians, sin
 from pathlib import Path
@@ -23,10 +18,10 @@ import numpy as np
 from sumo_cohesion.errors import SimulationError, UserError
 from sumo_cohesion.state import CartesianState, Scene
 from sumo_cohesion.traffic.demand import EGO
+from sumo_cohesion.traffic.library import captured_stderr, first_error, load_libsumo, load_window
 
 STEP_LENGTH = 0.1
 """Seconds per step, of SUMO and of every planner."""
-OLDEST_SUMO = (1, 24)
 _POSITION_TOLERANCE = 0.05
 """Metres by which SUMO's ego may differ from the driven one. Measured: below 0.001."""
 _KEEP_ROUTE_EXACT = 2
@@ -113,12 +108,12 @@ class Simulator:
                 "a SUMO simulation is already running in this process, and a second one would "
                 "silently replace it; close it first, or use another process"
             )
-        sumo, program = _load_window() if self._run.gui else (load_libsumo(), "sumo")
-        with _captured_stderr() as said:
+        sumo, program = load_window() if self._run.gui else (load_libsumo(), "sumo")
+        with captured_stderr() as said:
             try:
                 sumo.start([program, *self._run.options()])
             except Exception as error:
-                reason = _first_error(said()) or str(error)
+                reason = first_error(said()) or str(error)
                 raise UserError(f"SUMO cannot start this scenario: {reason}") from None
         _running = self._run.demand.name
         self._sumo = sumo
@@ -282,97 +277,3 @@ class Simulator:
         x = front[0] - length / 2 * cos(heading)
         y = front[1] - length / 2 * sin(heading)
         return CartesianState(x, y, heading, speed)
-
-
-def load_libsumo() -> Any:
-    """Import libsumo, quietly, and check that it is recent enough.
-
-    Raises
-    ------
-    UserError
-        If libsumo is missing or too old.
-    """
-    try:
-        # First, so that it is itself: with the variable below it would become libsumo.
-        import traci  # noqa: F401
-
-        with _quiet_import():
-            import libsumo
-    except ImportError as error:
-        raise UserError(f"libsumo cannot be loaded ({error}); pip install libsumo") from None
-    version = sumo_version(libsumo)
-    if version < OLDEST_SUMO:
-        raise UserError(
-            f"libsumo {libsumo.__version__} is too old; pip install --upgrade 'libsumo>=1.24'"
-        )
-    return libsumo
-
-
-@contextlib.contextmanager
-def _quiet_import() -> Iterator[None]:
-    """Keep libsumo from printing a warning about pyarrow's version, which would spoil --json.
-
-    Its import reads this variable. The two libraries are not used together here.
-    """
-    before = os.environ.get("LIBSUMO_AS_TRACI")
-    os.environ["LIBSUMO_AS_TRACI"] = "quiet"
-    try:
-        yield
-    finally:
-        if before is None:
-            del os.environ["LIBSUMO_AS_TRACI"]
-        else:
-            os.environ["LIBSUMO_AS_TRACI"] = before
-
-
-def sumo_version(libsumo: Any) -> tuple[int, int]:
-    """Return SUMO's version as (major, minor)."""
-    major, minor = str(libsumo.__version__).split(".")[:2]
-    return int(major), int(minor)
-
-
-def _load_window() -> tuple[Any, str]:
-    """Return traci, and the path of sumo-gui, which it drives from outside.
-
-    libsumo can show the window too, but does not always come back from closing it.
-    """
-    if sys.platform == "linux" and not os.environ.get("DISPLAY"):
-        raise UserError(
-            "--gui needs a screen and DISPLAY is not set; leave --gui out, or write the "
-            "scenario with `sumo-cohesion scenario export` and open it elsewhere"
-        )
-    program = shutil.which("sumo-gui") or shutil.which(
-        "sumo-gui", path=str(Path(sys.executable).parent)
-    )
-    if program is None:
-        raise UserError("--gui needs sumo-gui; pip install 'sumo-cohesion[gui]'")
-    load_libsumo()
-    import traci
-
-    return traci, program
-
-
-@contextlib.contextmanager
-def _captured_stderr() -> Iterator[Any]:
-    """Catch what SUMO's C++ code prints to standard error; yields a function to read it."""
-    sys.stderr.flush()
-    with tempfile.TemporaryFile() as sink:
-        kept = os.dup(2)
-        os.dup2(sink.fileno(), 2)
-
-        def said() -> str:
-            sink.seek(0)
-            return sink.read().decode(errors="replace")
-
-        try:
-            yield said
-        finally:
-            os.dup2(kept, 2)
-            os.close(kept)
-
-
-def _first_error(text: str) -> str:
-    """Return the first line of SUMO's messages that names an error."""
-    lines = [line.strip() for line in text.splitlines() if line.strip()]
-    errors = [line for line in lines if line.startswith("Error")]
-    return (errors or lines or [""])[0].removeprefix("Error:").strip()

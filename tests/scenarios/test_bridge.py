@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from sumo_cohesion.errors import SimulationError, UserError
-from sumo_cohesion.experiments.simulation import prepare
+from sumo_cohesion.experiments.setup import prepare
 from sumo_cohesion.state import CartesianState, Scene
 from sumo_cohesion.traffic.contact import contacts
 from sumo_cohesion.traffic.simulator import Simulator, SumoRun

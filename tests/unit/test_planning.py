@@ -11,12 +11,12 @@ import pytest
 from sumo_cohesion.errors import UserError
 from sumo_cohesion.perception.history import History
 from sumo_cohesion.planning import dynamics
+from sumo_cohesion.planning.fallback import fallback
 from sumo_cohesion.planning.mpc import Mpc, Problem
 from sumo_cohesion.planning.planners import (
     CohesivePlanner,
     Planner,
     SumoDriver,
-    fallback,
     make_planner,
 )
 from sumo_cohesion.planning.settings import PlannerSettings

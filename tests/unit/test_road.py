@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -10,7 +12,7 @@ from hypothesis import strategies as st
 from sumo_cohesion.errors import UserError
 from sumo_cohesion.road import Road
 from sumo_cohesion.traffic.network import Network
-from tests.conftest import NETWORKS
+from tests.conftest import NETWORKS, ROOT
 
 
 def test_round_trip_on_a_500_m_curve_is_within_2_cm(curve: Road) -> None:
@@ -64,18 +66,15 @@ def test_s_is_continuous_on_both_sides_of_a_curve(curve: Road) -> None:
 
 @given(x=st.floats(-90, 2090), y=st.floats(-60, 60))
 def test_straight_road_is_the_identity(x: float, y: float) -> None:
-    network = Network(NETWORKS.parent.parent / "networks" / "highway.net.xml")
-    road = _cached_road(network)
+    road = straight_road()
     s, d, heading, curvature = road.project(x, y)
     assert (s, d) == pytest.approx((x, y + 8.75), abs=1e-6)
     assert (heading, curvature) == pytest.approx((0.0, 0.0), abs=1e-9)
 
 
-_ROADS: dict[str, Road] = {}
-
-
-def _cached_road(network: Network) -> Road:
-    return _ROADS.setdefault("highway", network.road(["west", "east"]))
+@cache
+def straight_road() -> Road:
+    return Network(ROOT / "networks" / "highway.net.xml").road(["west", "east"])
 
 
 def test_lanes_edges_and_limit_of_the_highway(highway: Road) -> None:

@@ -1,0 +1,94 @@
+"""One run, checked and ready: everything that decides its result."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from sumo_cohesion.errors import UserError
+from sumo_cohesion.experiments.scenario import Scenario, load_scenario, settings_from
+from sumo_cohesion.planning.planners import cohesion_of, make_planner
+from sumo_cohesion.planning.settings import PlannerSettings
+from sumo_cohesion.road import Road
+from sumo_cohesion.social.settings import CohesionSettings
+from sumo_cohesion.traffic.demand import build_demand, check_demand, write_demand
+from sumo_cohesion.traffic.network import Network
+from sumo_cohesion.traffic.simulator import SumoRun
+
+
+@dataclass(frozen=True)
+class Setup:
+    """One run, checked and ready: everything that decides its result."""
+
+    scenario: Scenario
+    planner_name: str
+    settings: PlannerSettings
+    cohesion: CohesionSettings
+    seed: int
+    network: Path
+    routes: tuple[Path, ...]
+    additional: tuple[Path, ...]
+    route: tuple[str, ...]
+    road: Road
+
+    @property
+    def not_human(self) -> set[str]:
+        """Vehicles that the scenario hides or calls special: a stalled car, an ambulance."""
+        return {*self.scenario.sensing.hidden, *self.scenario.sensing.special}
+
+    def write_inputs(self, folder: Path, gui: bool = False) -> SumoRun:
+        """Write this seed's demand and return what SUMO needs."""
+        scenario = self.scenario
+        demand = build_demand(
+            self.routes, self.route, scenario.ego, scenario.randomize, self.not_human, self.seed
+        )
+        return SumoRun(
+            network=self.network,
+            demand=write_demand(demand, folder),
+            additional=self.additional,
+            seed=self.seed,
+            lateral_resolution=scenario.lateral_resolution,
+            gui=gui,
+        )
+
+
+def prepare(
+    scenario: str | Path,
+    planner: str = "cohesive",
+    seed: int = 0,
+    overrides: Mapping[str, Any] | None = None,
+) -> Setup:
+    """Check everything a run needs before SUMO starts.
+
+    Raises
+    ------
+    UserError
+        If the scenario, its network or demand, the planner or a setting is wrong.
+    """
+    if not 0 <= seed < 2**31:
+        raise UserError(f"seed {seed} is out of range; SUMO takes 0 to 2147483647")
+    settings, cohesion, scenario_overrides = settings_from(overrides or {})
+    loaded = load_scenario(scenario, scenario_overrides)
+    make_planner(planner, settings, cohesion)
+    network_file = loaded.file(loaded.network, "networks")
+    routes = tuple(loaded.file(name, "routes") for name in loaded.routes)
+    additional = tuple(loaded.file(name, "routes") for name in loaded.additional)
+    network = Network(network_file)
+    named = {*loaded.sensing.hidden, *loaded.sensing.special}
+    for event in loaded.events:
+        named |= {*event.who} | ({event.near} if event.near else set())
+    route = check_demand(network, routes, loaded.ego, named)
+    return Setup(
+        scenario=loaded,
+        planner_name=planner,
+        settings=settings,
+        cohesion=cohesion_of(planner, cohesion),
+        seed=seed,
+        network=network_file,
+        routes=routes,
+        additional=additional,
+        route=tuple(route),
+        road=network.road(route),
+    )
