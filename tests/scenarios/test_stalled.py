@@ -220,3 +220,41 @@ def test_a_dead_worker_is_one_line_and_finished_runs_are_kept(tmp_path: Path) ->
     kept = load_metrics(tmp_path / "result.unfinished")
     assert kept["seed"].tolist() == [0, 1]
     assert (kept["planner"] == "sumo").all()
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="needs Linux")
+def test_workers_end_when_their_parent_is_killed(tmp_path: Path) -> None:
+    import signal
+    import subprocess
+    import sys
+    import time
+
+    code = "from sumo_cohesion import compare; compare('stalled', ('sumo',), range(500), workers=2)"
+    script = tmp_path / "batch.py"
+    script.write_text(f"if __name__ == '__main__':\n    {code}\n")
+    parent = subprocess.Popen([sys.executable, script])
+    children = Path(f"/proc/{parent.pid}/task/{parent.pid}/children")
+    workers: list[str] = []
+    for _ in range(300):
+        time.sleep(0.1)
+        workers = children.read_text().split()
+        if len(workers) >= 2:
+            break
+    assert len(workers) >= 2
+    time.sleep(3.0)
+    parent.send_signal(signal.SIGKILL)
+    parent.wait()
+    for _ in range(100):
+        alive = [pid for pid in workers if _is_running(pid)]
+        if not alive:
+            break
+        time.sleep(0.1)
+    assert alive == []
+
+
+def _is_running(pid: str) -> bool:
+    try:
+        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+    except OSError:
+        return False
+    return state != "Z"
