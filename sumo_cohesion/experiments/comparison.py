@@ -76,7 +76,8 @@ def compare(
     UserError
         If the input is wrong; nothing has been run then.
     SimulationError
-        If a run or its process failed; finished runs are kept in a folder that is named.
+        If a run or its process failed, or Ctrl-C was pressed. Finished runs are then kept in
+        a folder that the message names.
     """
     if not planners or not seeds:
         raise UserError("nothing to compare: give at least one planner and one seed")
@@ -102,11 +103,13 @@ def compare(
         ]
         try:
             rows = _run_all(jobs, workers, progress)
-        except (SimulationError, KeyboardInterrupt) as error:
+        except (SimulationError, UserError, KeyboardInterrupt) as error:
             kept = _keep(new, folder)
-            if isinstance(error, KeyboardInterrupt) or kept is None:
+            if kept is None:
                 raise
-            raise SimulationError(f"{error}; finished runs are kept in {kept}") from None
+            kind = UserError if isinstance(error, UserError) else SimulationError
+            reason = str(error) or "interrupted"
+            raise kind(f"{reason}; finished runs are kept in {kept}") from None
         comparison = _compared(rows, folder)
         comparison.runs.to_parquet(new / "metrics.parquet", index=False)
         comparison.summary.to_parquet(new / "summary.parquet", index=False)
@@ -159,7 +162,7 @@ def _keep(new: Path, folder: Path) -> Path | None:
         return None
     kept = folder.with_name(folder.name + ".unfinished")
     shutil.rmtree(kept, ignore_errors=True)
-    shutil.copytree(new, kept)
+    new.rename(kept)
     return kept
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from sumo_cohesion.planning.dynamics import DT
 from sumo_cohesion.planning.settings import PlannerSettings
 from sumo_cohesion.road import Road
 from sumo_cohesion.state import AgreementRow, Control, Observation, Plan
@@ -29,7 +30,7 @@ def fallback(
     bend = -2.0 * ego.heading / reach - (ego.d - centre) / reach**2
     curvature = float(road.curvature_at(ego.s)) + bend
     curvature = float(np.clip(curvature, -settings.max_curvature, settings.max_curvature))
-    braking = min(BRAKING, ego.speed / 0.1)
+    braking = min(BRAKING, ego.speed / DT)
     control = Control(curvature, settings.friction * ego.speed - braking)
     return Plan(
         controls=(control,),

@@ -14,12 +14,11 @@ import casadi as ca
 import numpy as np
 
 from sumo_cohesion.planning import dynamics, reward
+from sumo_cohesion.planning.dynamics import DT
 from sumo_cohesion.planning.settings import PlannerSettings, RewardWeights
 from sumo_cohesion.social.features import FEATURES, social_features
 from sumo_cohesion.state import FloatArray, RoadState
 
-DT = 0.1
-"""Seconds per step."""
 FAR_AWAY = 1e4
 """Metres at which lanes and cars that do not exist are put: their Gaussians are zero there."""
 _CONTROL_SCALE = np.array([0.01, 5.0])

@@ -17,6 +17,7 @@ import numpy as np
 
 from sumo_cohesion.errors import UserError
 from sumo_cohesion.perception.history import History
+from sumo_cohesion.planning.dynamics import DT
 from sumo_cohesion.planning.fallback import fallback
 from sumo_cohesion.planning.settings import PlannerSettings
 from sumo_cohesion.road import Road
@@ -101,7 +102,7 @@ class CohesivePlanner:
         groups = agree(group_votes(ego, history, road, cohesion), cohesion)
         place = NOWHERE
         if cohesion.place_weight > 0.0:
-            ahead = [ego.s + 0.1 * ego.speed * t for t in self._place_steps]
+            ahead = [ego.s + DT * ego.speed * t for t in self._place_steps]
             place = agree_on_place(ego, history, road, ahead, cohesion)
         if cohesion.lateral_votes == "most_surprising":
             groups, place = elect_lateral(groups, place, cohesion.surprise)
@@ -110,7 +111,7 @@ class CohesivePlanner:
     def _problem(
         self, observation: Observation, groups: tuple[Agreement, ...], place: Place
     ) -> Problem:
-        from sumo_cohesion.planning.mpc import DT, FAR_AWAY, Problem
+        from sumo_cohesion.planning.mpc import FAR_AWAY, Problem
 
         horizon, road, ego = self.settings.horizon, self._road, observation.ego
         # Where the ego will be if it keeps its speed: the road is looked up there.
@@ -141,7 +142,7 @@ class CohesivePlanner:
             right=right,
             left=left,
             speed_limit=road.speed_limit_at(s[1:]),
-            cars=self._predict_cars(observation, DT, FAR_AWAY),
+            cars=self._predict_cars(observation, FAR_AWAY),
             theta=self._theta,
             cohesion_weight=weight,
             cohesion_target=target,
@@ -149,7 +150,7 @@ class CohesivePlanner:
             place_target=place_target,
         )
 
-    def _predict_cars(self, observation: Observation, dt: float, far: float) -> FloatArray:
+    def _predict_cars(self, observation: Observation, far: float) -> FloatArray:
         """Predict the nearest cars at constant velocity: (6, N, T), see reward.StageInputs."""
         horizon, n = self.settings.horizon, self.settings.cars
         cars = np.zeros((6, n, horizon))
@@ -159,7 +160,7 @@ class CohesivePlanner:
         nearest = np.argsort((offset * offset).sum(axis=1), kind="stable")[:n]
         s, d, heading, speed = states[nearest].T
         m = nearest.size
-        ahead = dt * np.arange(1, horizon + 1)
+        ahead = DT * np.arange(1, horizon + 1)
         stretch = 1.0 - observation.curvature[nearest] * d
         cos, sin = np.cos(heading), np.sin(heading)
         cars[0, :m] = s[:, None] + (speed * cos / stretch)[:, None] * ahead
@@ -210,15 +211,14 @@ def explain(
     if not groups:
         return ()
     s, d, heading, speed = observation.ego
-    dt = 0.1
     curvature = float(road.curvature_at(s))
     on = (
-        s + dt * speed * np.cos(heading) / (1.0 - curvature * d),
-        d + dt * speed * np.sin(heading),
+        s + DT * speed * np.cos(heading) / (1.0 - curvature * d),
+        d + DT * speed * np.sin(heading),
         heading,
         speed,
     )
-    own = social_features(observation.ego, on, dt, curvature)
+    own = social_features(observation.ego, on, DT, curvature)
     rows = [
         AgreementRow(g.group, name, g.n, m, v, w, float(o), float(beta * w * (m - o) ** 2))
         for g in groups
