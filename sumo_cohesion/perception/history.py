@@ -1,7 +1,7 @@
 """What the ego has seen of others: transitions, in bounded memory.
 
-Plain Python numbers: the ego has a handful of cars around it, and for so few, arrays cost
-several times more than loops. Memory and time depend on how many cars were met within the
+Plain Python numbers: the ego has a handful of cars around it, and for so few, loops cost less
+than arrays. Memory and time depend on how many cars were met within the
 memory, never on how long the simulation has run.
 """
 
