@@ -1,8 +1,8 @@
 """What the ego has seen of others: transitions, in bounded memory.
 
 Plain Python numbers: the ego has a handful of cars around it, and for so few, loops cost less
-than arrays. Memory and time depend on how many cars were met within the
-memory, never on how long the simulation has run.
+than arrays. Memory and time depend on how many cars were met within the memory, never on how long
+the simulation has run.
 """
 
 from __future__ import annotations
