@@ -48,7 +48,7 @@ evidence: $(VENV)/.installed
 	$(BIN)/python analysis/stalled.py
 
 benchmark: $(VENV)/.installed
-	$(BIN)/python benchmarks/rooms.py
+	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python benchmarks/rooms.py | tee benchmarks/rooms.txt
 
 wheel: $(VENV)/.installed
 	$(BIN)/python -m build --wheel
