@@ -8,7 +8,7 @@ export OPENBLAS_NUM_THREADS := 1
 .PHONY: demo test lint check format networks docs lock wheel benchmark evidence clean
 
 demo: $(VENV)/.installed
-	$(BIN)/sumo-cohesion compare stalled --seeds 0:10 --out demo
+	$(BIN)/sumo-cohesion compare stalled --seeds 0:8 --out demo
 	@echo "The picture is demo/paths.png"
 
 test: $(VENV)/.installed
