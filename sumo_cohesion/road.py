@@ -128,7 +128,8 @@ class Road:
     def project(self, x: float, y: float) -> tuple[float, float, float, float]:
         """Road coordinates of one Cartesian point.
 
-        Scalar arithmetic: for the handful of cars around an ego it costs less than arrays. Points beyond the ends are measured from the line's extension.
+        Scalar arithmetic: for the handful of cars around an ego it costs less than arrays.
+        Points beyond the ends are measured from the line's extension.
 
         Returns
         -------
