@@ -18,7 +18,7 @@ from typing import Any
 import pandas as pd
 
 from sumo_cohesion.errors import SimulationError, UserError
-from sumo_cohesion.experiments.rollout import RUN_FILE, Rollout, whole_folder
+from sumo_cohesion.experiments.rollout import RUN_FILE, Rollout, require_replaceable, whole_folder
 from sumo_cohesion.experiments.setup import prepare
 from sumo_cohesion.experiments.simulation import simulate
 from sumo_cohesion.experiments.statistics import summarize
@@ -93,8 +93,7 @@ def compare(
     if folder is None:
         jobs = [_Job(str(scenario), p, s, settings, None) for p in planners for s in seeds]
         return _compared(_run_all(jobs, workers, progress), None)
-    if folder.exists() and not _replaceable(folder):
-        raise UserError(f"{folder}: not empty and not a comparison; choose another --out")
+    require_replaceable(folder, COMPARISON_FILE)
     with whole_folder(folder) as new:
         jobs = [
             _Job(str(scenario), p, s, settings, run_folder(new, p, s))
@@ -150,10 +149,6 @@ def _read(path: Path) -> pd.DataFrame:
         return pd.read_parquet(path)
     except (OSError, ValueError) as error:
         raise UserError(f"{path}: not a readable table ({error}); run it again") from None
-
-
-def _replaceable(folder: Path) -> bool:
-    return folder.is_dir() and ((folder / COMPARISON_FILE).is_file() or not any(folder.iterdir()))
 
 
 def _keep(new: Path, folder: Path) -> Path | None:

@@ -7,8 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from sumo_cohesion.errors import UserError
-from sumo_cohesion.experiments.rollout import whole_folder
+from sumo_cohesion.experiments.rollout import require_replaceable, whole_folder
 from sumo_cohesion.experiments.setup import prepare
 
 CONFIG_FILE = "scenario.sumocfg"
@@ -31,8 +30,7 @@ def export_scenario(
         If the scenario is wrong or the folder holds something else.
     """
     target = Path(folder)
-    if target.exists() and not (target / CONFIG_FILE).is_file() and any(target.iterdir()):
-        raise UserError(f"{target}: not empty and not an exported scenario; choose another --out")
+    require_replaceable(target, CONFIG_FILE)
     setup = prepare(scenario, "sumo", seed, overrides)
     with whole_folder(target) as new:
         setup.write_inputs(new).write_config(new / CONFIG_FILE)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import platform
 import shutil
 import tempfile
@@ -48,10 +47,7 @@ class Rollout:
 
     def write(self, folder: Path) -> Path:
         """Write run.json and one parquet file per table, all of them or none."""
-        if (folder / RUN_FILE).exists() or not folder.exists():
-            pass
-        elif not folder.is_dir() or any(folder.iterdir()):
-            raise UserError(f"{folder}: not a run's folder and not empty; choose another --out")
+        require_replaceable(folder, RUN_FILE)
         with whole_folder(folder) as new:
             for name in ("trajectory", "plan", "agreement", "timing", "metrics"):
                 getattr(self, name).to_parquet(new / f"{name}.parquet", index=False)
@@ -69,6 +65,16 @@ class Rollout:
         except (OSError, ValueError) as error:
             raise UserError(f"{folder}: not a complete run ({error}); run it again") from None
         return Rollout(info=info, **tables)
+
+
+def require_replaceable(folder: Path, marker: str) -> None:
+    """Raise UserError unless a folder is new, empty, or an earlier result (holds ``marker``)."""
+    if not folder.exists():
+        return
+    if not folder.is_dir() or (any(folder.iterdir()) and not (folder / marker).is_file()):
+        raise UserError(
+            f"{folder}: holds something else than an earlier result; choose another --out"
+        )
 
 
 class whole_folder:  # noqa: N801 - reads as a function where it is used
@@ -273,10 +279,3 @@ class Recorder:
                 "sumo_ms": milliseconds[:, 2],
             },
         )
-
-
-def free_bytes(folder: Path) -> int:
-    """Bytes free where a folder is or will be."""
-    while not folder.exists():
-        folder = folder.parent
-    return shutil.disk_usage(os.fspath(folder)).free

@@ -9,7 +9,13 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
-from sumo_cohesion.experiments.rollout import Ending, Recorder, Rollout
+from sumo_cohesion.experiments.rollout import (
+    RUN_FILE,
+    Ending,
+    Recorder,
+    Rollout,
+    require_replaceable,
+)
 from sumo_cohesion.experiments.setup import Setup, prepare
 from sumo_cohesion.perception.history import History
 from sumo_cohesion.perception.observation import Sensor
@@ -58,6 +64,8 @@ def run(
     SimulationError
         If the simulation cannot be trusted.
     """
+    if out is not None:
+        require_replaceable(Path(out), RUN_FILE)  # before the drive, not after
     setup = prepare(scenario, planner, seed, overrides)
     rollout = simulate(setup, make_planner(planner, setup.settings, setup.cohesion), gui=gui)
     if out is not None:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import xml.etree.ElementTree as ET
 from collections.abc import Collection, Sequence
+from math import isfinite
 from pathlib import Path
 from typing import Annotated
 
@@ -102,12 +103,23 @@ def check_demand(
                         )
             if element.tag in ("vehicle", "trip", "flow"):
                 ids.add(element.get("id", ""))
+            _require_finite(path, element)
     if EGO in ids:
         raise UserError(f"a route file has a vehicle {EGO!r}; the scenario's [ego] adds it")
     missing = sorted(set(named) - ids)
     if missing:
         raise UserError(f"the scenario names vehicle {missing[0]!r}, which no route file has")
     return route
+
+
+def _require_finite(path: Path, element: ET.Element) -> None:
+    """Reject nan and inf: SUMO takes them without a word and simulates nonsense."""
+    for key, text in element.attrib.items():
+        if key != "id" and text.strip().lower().lstrip("+-") in ("nan", "inf", "infinity"):
+            raise UserError(
+                f"{path}: {key} = {text!r} of {element.tag} {element.get('id', '')!r} is not a "
+                "finite number"
+            )
 
 
 def build_demand(
@@ -137,7 +149,7 @@ def build_demand(
     gaps = rng.uniform(*spacing, len(others)) if spacing else np.zeros(len(others))
     count = (
         rng.integers(randomization.humans[0], randomization.humans[1] + 1)
-        if (randomization.humans)
+        if randomization.humans
         else len(humans)
     )
 
@@ -183,10 +195,9 @@ def _leads(humans: Sequence[ET.Element], ego: EgoDemand) -> list[ET.Element]:
 
 def _numeric(text: str | None) -> bool:
     try:
-        float(text or "")
+        return isfinite(float(text or ""))
     except ValueError:
         return False
-    return True
 
 
 def _speed_factor(vehicle: ET.Element, types: dict[str | None, ET.Element], normal: float) -> float:
@@ -245,7 +256,7 @@ def _add_ego(routes: ET.Element, route: Sequence[str], ego: EgoDemand) -> None:
     timed = [e for e in routes if e.get("depart") or e.get("begin")]
     for element in timed:
         routes.remove(element)
-    routes.extend(sorted(timed, key=lambda e: _departure(e)))
+    routes.extend(sorted(timed, key=_departure))
 
 
 def _departure(element: ET.Element) -> float:

@@ -87,10 +87,6 @@ class Network:
         """Length (m) of an edge."""
         return float(self._edge(edge).getLength())
 
-    def speed_limit(self, edge: str) -> float:
-        """Speed limit (m/s) of an edge."""
-        return float(self._edge(edge).getSpeed())
-
     def route(self, origin: str, destination: str) -> list[str]:
         """Edges of the shortest route for cars between two edges, both included."""
         path, _ = self._net.getShortestPath(

@@ -123,6 +123,7 @@ def test_scenario_files(
         ("routes", ROUTES.replace('departLane="2"', 'departLane="9"'), ["departLane", "other_1"]),
         ("routes", ROUTES.replace('type="human"', 'type="alien"'), ["alien"]),
         ("routes", ROUTES.replace('departPos="160"', 'departPos="far"'), ["lead_1", "departPos"]),
+        ("routes", ROUTES.replace('departPos="160"', 'departPos="nan"'), ["lead_1", "departPos"]),
         ("routes", ROUTES.replace('id="lead_1"', 'id="ego"'), ["'ego'"]),
         ("routes", ROUTES.replace('id="lead_1"', 'id="lead_2"'), ["lead_2"]),
     ],
