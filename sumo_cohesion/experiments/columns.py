@@ -75,6 +75,22 @@ TIMING = (
     Column("sumo_ms", "float64", "ms", "SUMO's step, and reading the next scene"),
 )
 
+REFERENCE = (
+    Column("time", "float64", "s", "SUMO time"),
+    Column(
+        "plan_lateral", "float64", "m", "largest change of d within the horizon, plan minus nominal"
+    ),
+    Column(
+        "plan_speed",
+        "float64",
+        "m/s",
+        "largest change of speed within the horizon, plan minus nominal",
+    ),
+    Column("twin_s", "float64", "m", "the nominal twin: along the ego's route"),
+    Column("twin_d", "float64", "m", "the nominal twin: left of the reference line"),
+    Column("twin_speed", "float64", "m/s", "the nominal twin"),
+)
+
 METRICS = (
     Column("scenario", "string", "", "scenario name"),
     Column("planner", "string", "", "planner name"),
@@ -94,6 +110,12 @@ METRICS = (
     Column("speed_gap_closed", "float64", "", "share of the humans' gap to the limit; see docs"),
     Column("max_lateral_shift", "float64", "m", "largest distance across from where it started"),
     Column("max_speed_shift", "float64", "m/s", "largest difference from the limit"),
+    Column("plan_lateral_change", "float64", "m", "largest, what cohesion changed in one plan"),
+    Column("plan_speed_change", "float64", "m/s", "largest, what cohesion changed in one plan"),
+    Column("twin_lateral_deviation", "float64", "m", "largest distance across from the twin"),
+    Column("twin_speed_deviation", "float64", "m/s", "largest difference from the twin"),
+    Column("nominal_lateral_deviation", "float64", "m", "as twin, but from nominal's own run"),
+    Column("nominal_speed_deviation", "float64", "m/s", "as twin, but from nominal's own run"),
     Column("emergency_delay", "float64", "s", "lost by the special vehicle since the first event"),
     Column("yield_time", "float64", "s", "from the first event to the ego being half a lane right"),
     Column("lane_changes", "int64", "", "changes of the ego's nearest lane"),
@@ -115,6 +137,7 @@ TABLES = {
     "plan": PLAN,
     "agreement": AGREEMENT,
     "timing": TIMING,
+    "reference": REFERENCE,
     "metrics": METRICS,
 }
 

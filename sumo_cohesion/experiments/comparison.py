@@ -13,11 +13,12 @@ from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pandas as pd
 
 from sumo_cohesion.errors import SimulationError, UserError
+from sumo_cohesion.experiments.metrics import deviation
 from sumo_cohesion.experiments.rollout import RUN_FILE, Rollout, require_replaceable, whole_folder
 from sumo_cohesion.experiments.setup import prepare
 from sumo_cohesion.experiments.simulation import simulate
@@ -25,6 +26,7 @@ from sumo_cohesion.experiments.statistics import summarize
 from sumo_cohesion.planning.planners import Planner, make_planner
 from sumo_cohesion.planning.settings import PlannerSettings
 from sumo_cohesion.social.settings import CohesionSettings
+from sumo_cohesion.traffic.demand import EGO
 
 COMPARISON_FILE = "comparison.json"
 Progress = Callable[[int, int], None]
@@ -38,6 +40,13 @@ class Comparison:
     runs: pd.DataFrame
     summary: pd.DataFrame
     folder: Path | None
+
+
+class _Result(NamedTuple):
+    """One run's metrics row, and the ego's path: columns time (s), d (m), speed (m/s)."""
+
+    metrics: pd.DataFrame
+    path: pd.DataFrame
 
 
 @dataclass(frozen=True)
@@ -92,7 +101,7 @@ def compare(
     settings = tuple(sorted((overrides or {}).items()))
     if folder is None:
         jobs = [_Job(str(scenario), p, s, settings, None) for p in planners for s in seeds]
-        return _compared(_run_all(jobs, workers, progress), None)
+        return _compared(jobs, _run_all(jobs, workers, progress), None)
     require_replaceable(folder, COMPARISON_FILE)
     with whole_folder(folder) as new:
         jobs = [
@@ -101,7 +110,7 @@ def compare(
             for s in seeds
         ]
         try:
-            rows = _run_all(jobs, workers, progress)
+            results = _run_all(jobs, workers, progress)
         except (SimulationError, UserError, KeyboardInterrupt) as error:
             kept = _keep(new, folder)
             if kept is None:
@@ -109,7 +118,7 @@ def compare(
             kind = UserError if isinstance(error, UserError) else SimulationError
             reason = str(error) or "interrupted"
             raise kind(f"{reason}; finished runs are kept in {kept}") from None
-        comparison = _compared(rows, folder)
+        comparison = _compared(jobs, results, folder)
         comparison.runs.to_parquet(new / "metrics.parquet", index=False)
         comparison.summary.to_parquet(new / "summary.parquet", index=False)
         about = {
@@ -161,25 +170,29 @@ def _keep(new: Path, folder: Path) -> Path | None:
     return kept
 
 
-def _compared(rows: list[pd.DataFrame], folder: Path | None) -> Comparison:
-    runs = pd.concat(rows, ignore_index=True)
+def _compared(jobs: Sequence[_Job], results: Sequence[_Result], folder: Path | None) -> Comparison:
+    runs = pd.concat([result.metrics for result in results], ignore_index=True)
+    nominal = {j.seed: r.path for j, r in zip(jobs, results, strict=True) if j.planner == "nominal"}
+    for i, (job, result) in enumerate(zip(jobs, results, strict=True)):
+        if job.seed in nominal:
+            runs.loc[i, ["nominal_lateral_deviation", "nominal_speed_deviation"]] = deviation(
+                result.path, nominal[job.seed]
+            )
     return Comparison(runs, summarize(runs), folder)
 
 
-def _run_all(
-    jobs: Sequence[_Job], workers: int | None, progress: Progress | None
-) -> list[pd.DataFrame]:
+def _run_all(jobs: Sequence[_Job], workers: int | None, progress: Progress | None) -> list[_Result]:
     """Run all jobs; results in the order of the jobs, whatever the number of workers."""
     count = min(workers or os.cpu_count() or 1, len(jobs))
-    done: dict[int, pd.DataFrame] = {}
-    for i, row in _results(jobs, count):
-        done[i] = row
+    done: dict[int, _Result] = {}
+    for i, result in _results(jobs, count):
+        done[i] = result
         if progress is not None:
             progress(len(done), len(jobs))
     return [done[i] for i in range(len(jobs))]
 
 
-def _results(jobs: Sequence[_Job], workers: int) -> Iterator[tuple[int, pd.DataFrame]]:
+def _results(jobs: Sequence[_Job], workers: int) -> Iterator[tuple[int, _Result]]:
     # The workers' linear algebra must not start threads of its own: they would fight for cores.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -212,13 +225,14 @@ def _end_with_parent() -> None:
         threading.Thread(target=watch, daemon=True).start()
 
 
-def _run_job(job: _Job) -> pd.DataFrame:
+def _run_job(job: _Job) -> _Result:
     setup = prepare(job.scenario, job.planner, job.seed, dict(job.overrides))
     planner = _planner(job.planner, setup.settings, setup.cohesion)
     rollout: Rollout = simulate(setup, planner)
     if job.out is not None:
         rollout.write(job.out)
-    return rollout.metrics
+    table = rollout.trajectory
+    return _Result(rollout.metrics, table.loc[table["vehicle"] == EGO, ["time", "d", "speed"]])
 
 
 @lru_cache(maxsize=8)

@@ -21,7 +21,11 @@ _EGO = "ego"
 
 
 def run_metrics(
-    info: Mapping[str, Any], trajectory: pd.DataFrame, plan: pd.DataFrame, timing: pd.DataFrame
+    info: Mapping[str, Any],
+    trajectory: pd.DataFrame,
+    plan: pd.DataFrame,
+    timing: pd.DataFrame,
+    reference: pd.DataFrame,
 ) -> pd.DataFrame:
     """All metrics of one run: one row, see columns.METRICS."""
     ego = trajectory[trajectory["vehicle"] == _EGO]
@@ -45,6 +49,7 @@ def run_metrics(
         "travel_time": float(end - start),
         "mean_speed": distance / float(end - start),
         "speed_gap_closed": speed_gap_closed(ego, others, plan),
+        **reference_metrics(ego, reference),
         **emergency_metrics(info, ego, others),
         "max_lateral_shift": float((ego["d"] - ego["d"].iloc[0]).abs().max()),
         "max_speed_shift": max_speed_shift(ego, plan),
@@ -109,6 +114,37 @@ def max_speed_shift(ego: pd.DataFrame, plan: pd.DataFrame) -> float:
     """Largest difference (m/s) between the ego's speed and the limit of its route."""
     speed = ego["speed"].to_numpy()[: len(plan)]
     return float(np.abs(speed - plan["speed_limit"].to_numpy()).max())
+
+
+def reference_metrics(ego: pd.DataFrame, reference: pd.DataFrame) -> dict[str, float]:
+    """Say what cohesion changed: largest absolute values over the run; NaN without a reference.
+
+    plan_*: after one horizon, against the nominal plan from the same state. twin_*: against a
+    nominal car that started as the ego did and drove through the same traffic on its own.
+    nominal_*, against nominal's own run of the same seed, needs that run: compare() fills it in.
+    """
+    twin = reference.merge(ego[["time", "d", "speed"]], on="time")
+    return {
+        "plan_lateral_change": _largest(reference["plan_lateral"]),
+        "plan_speed_change": _largest(reference["plan_speed"]),
+        "twin_lateral_deviation": _largest(twin["d"] - twin["twin_d"]),
+        "twin_speed_deviation": _largest(twin["speed"] - twin["twin_speed"]),
+        "nominal_lateral_deviation": np.nan,
+        "nominal_speed_deviation": np.nan,
+    }
+
+
+def deviation(ego: pd.DataFrame, other: pd.DataFrame) -> tuple[float, float]:
+    """Largest distance across (m) and difference of speed (m/s) between two runs' egos.
+
+    ``ego`` and ``other`` have columns time, d, speed; only times that both have count.
+    """
+    both = ego.merge(other, on="time", suffixes=("", "_other"))
+    return _largest(both["d"] - both["d_other"]), _largest(both["speed"] - both["speed_other"])
+
+
+def _largest(values: pd.Series) -> float:
+    return float(values.abs().max()) if len(values) else np.nan
 
 
 def emergency_metrics(

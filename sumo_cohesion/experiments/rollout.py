@@ -15,9 +15,11 @@ import numpy as np
 import pandas as pd
 
 from sumo_cohesion.errors import UserError
-from sumo_cohesion.experiments.columns import as_table
+from sumo_cohesion.experiments.columns import TABLES, as_table
 from sumo_cohesion.experiments.metrics import run_metrics
-from sumo_cohesion.road import Road
+from sumo_cohesion.experiments.reference import Reference
+from sumo_cohesion.perception.history import History
+from sumo_cohesion.perception.observation import Sensor
 from sumo_cohesion.state import BoolArray, Control, FloatArray, Observation, Plan, RoadState, Scene
 from sumo_cohesion.traffic.demand import EGO
 
@@ -35,7 +37,8 @@ class Rollout:
     Attributes
     ----------
     info : scenario, planner, settings, seed, versions and outcome, ready for JSON.
-    trajectory, plan, agreement, timing, metrics : tables; see docs/tables.md for their columns.
+    trajectory, plan, agreement, timing, reference, metrics : tables; see docs/tables.md for
+        their columns.
     """
 
     info: dict[str, Any]
@@ -43,13 +46,14 @@ class Rollout:
     plan: pd.DataFrame
     agreement: pd.DataFrame
     timing: pd.DataFrame
+    reference: pd.DataFrame
     metrics: pd.DataFrame
 
     def write(self, folder: Path) -> Path:
         """Write run.json and one parquet file per table, all of them or none."""
         require_replaceable(folder, RUN_FILE)
         with whole_folder(folder) as new:
-            for name in ("trajectory", "plan", "agreement", "timing", "metrics"):
+            for name in TABLES:
                 getattr(self, name).to_parquet(new / f"{name}.parquet", index=False)
             text = json.dumps(self.info, indent=2, ensure_ascii=False)
             (new / RUN_FILE).write_text(text + "\n", encoding="utf-8")
@@ -60,8 +64,7 @@ class Rollout:
         """Read a folder that `write` wrote."""
         try:
             info = json.loads((folder / RUN_FILE).read_text(encoding="utf-8"))
-            names = ("trajectory", "plan", "agreement", "timing", "metrics")
-            tables = {name: pd.read_parquet(folder / f"{name}.parquet") for name in names}
+            tables = {name: pd.read_parquet(folder / f"{name}.parquet") for name in TABLES}
         except (OSError, ValueError) as error:
             raise UserError(f"{folder}: not a complete run ({error}); run it again") from None
         return Rollout(info=info, **tables)
@@ -133,9 +136,10 @@ class Ending(NamedTuple):
 class Recorder:
     """Collects the steps of one run and turns them into tables at its end."""
 
-    def __init__(self, road: Road, ego_size: tuple[float, float]) -> None:
-        self._road = road
-        self._ego_size = ego_size
+    def __init__(self, setup: Setup, sensor: Sensor) -> None:
+        self._setup = setup
+        self._road = setup.road
+        self._reference = Reference(setup, sensor) if setup.scenario.reference else None
         self._scenes: list[Scene] = []
         self._visible: list[frozenset[str]] = []
         self._plans: list[tuple[float, RoadState, Plan]] = []
@@ -145,25 +149,26 @@ class Recorder:
         self,
         scene: Scene,
         observation: Observation,
+        history: History,
         plan: Plan,
         seconds: tuple[float, float, float],
     ) -> None:
         """Record one step; ``seconds`` spent on perception, planning and SUMO."""
+        if self._reference is not None:
+            self._reference.add(scene, observation, history, plan)
         self._scenes.append(scene)
         self._visible.append(frozenset(observation.ids))
         self._plans.append((scene.time, observation.ego, plan))
         self._seconds.append(seconds)
 
-    def finish(
-        self,
-        setup: Setup,
-        last: Scene,
-        ending: Ending,
-    ) -> Rollout:
+    def finish(self, last: Scene, ending: Ending) -> Rollout:
         """Build the rollout; ``last`` is the scene after the last step."""
+        setup = self._setup
         self._scenes.append(last)
         self._visible.append(self._visible[-1])
-        trajectory = self._trajectory()
+        trajectory = self._trajectory(last.ego_size)
+        rows = [] if self._reference is None else self._reference.rows
+        reference = as_table("reference", rows)
         plan, agreement, timing = self._plan_table(), self._agreement_table(), self._timing_table()
         info = {
             "scenario": setup.scenario.model_dump(mode="json"),
@@ -180,10 +185,10 @@ class Recorder:
             "n_route_lanes": setup.road.n_route_lanes,
             "versions": versions(),
         }
-        metrics = run_metrics(info, trajectory, plan, timing)
-        return Rollout(info, trajectory, plan, agreement, timing, metrics)
+        metrics = run_metrics(info, trajectory, plan, timing, reference)
+        return Rollout(info, trajectory, plan, agreement, timing, reference, metrics)
 
-    def _trajectory(self) -> pd.DataFrame:
+    def _trajectory(self, ego_size: tuple[float, float]) -> pd.DataFrame:
         counts = np.array([len(scene.ids) for scene in self._scenes])
         others = np.concatenate([scene.states for scene in self._scenes])
         sizes = np.concatenate([scene.sizes for scene in self._scenes])
@@ -208,8 +213,8 @@ class Recorder:
             "d": frenet[:, 1],
             "road_heading": frenet[:, 2],
             "lane": self._road.lane_index(frenet[:, 0], frenet[:, 1]),
-            "length": np.concatenate((np.full(len(egos), self._ego_size[0]), sizes[:, 0])),
-            "width": np.concatenate((np.full(len(egos), self._ego_size[1]), sizes[:, 1])),
+            "length": np.concatenate((np.full(len(egos), ego_size[0]), sizes[:, 0])),
+            "width": np.concatenate((np.full(len(egos), ego_size[1]), sizes[:, 1])),
         }
         order = np.argsort(np.concatenate((step, np.repeat(step, counts))), kind="stable")
         return as_table("trajectory", dict(columns)).iloc[order].reset_index(drop=True)

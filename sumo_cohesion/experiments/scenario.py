@@ -62,6 +62,8 @@ class Scenario(_Data):
     duration : seconds after the ego's departure.
     lateral_resolution : width (m) of SUMO's sublanes.
     events : what humans are told, and when, where SUMO has no such rule.
+    reference : also drive a nominal twin beside the ego, for the metrics that compare with it
+        (experiments.reference); it costs two more plans per step.
     success : each key a metric, each value what it must be: a value or {min, max}.
     """
 
@@ -76,6 +78,7 @@ class Scenario(_Data):
     sensing: Sensing = Sensing()
     randomize: Randomization = Randomization()
     events: tuple[Event, ...] = ()
+    reference: bool = False
     success: dict[str, bool | float | Bounds]
     _folder: Path = PrivateAttr(default=Path())
 

@@ -80,7 +80,7 @@ def simulate(setup: Setup, planner: Planner, *, gui: bool = False) -> Rollout:
     sensor = Sensor(road, sensing.range, sensing.hidden, sensing.special)
     memory = setup.cohesion.interval, setup.cohesion.memory
     history = History(STEP_LENGTH, *memory, describe=social_features)
-    recorder = Recorder(road, size)
+    recorder = Recorder(setup, sensor)
     planner.reset(road)
     with (
         tempfile.TemporaryDirectory() as folder,
@@ -101,7 +101,7 @@ def simulate(setup: Setup, planner: Planner, *, gui: bool = False) -> Rollout:
             sumo.step(ego)
             following = sumo.read()
             t3 = perf_counter()
-            recorder.add(scene, observation, plan, (t1 - t0, t2 - t1, t3 - t2))
+            recorder.add(scene, observation, history, plan, (t1 - t0, t2 - t1, t3 - t2))
             scene = following
             touched = contacts(scene.ego, scene.ego_size, scene.states, scene.sizes)
             if touched.size:
@@ -112,7 +112,7 @@ def simulate(setup: Setup, planner: Planner, *, gui: bool = False) -> Rollout:
                 outcome = "finished"
         names = [scene.ids[i] for i in touched]
         ended = Ending(outcome, names, sumo.reported_contacts(), drivers.triggered)
-        return recorder.finish(setup, scene, ended)
+        return recorder.finish(scene, ended)
 
 
 def _plan(planner: Planner, observation: Observation, history: History, setup: Setup) -> Plan:
