@@ -24,6 +24,7 @@ from sumo_cohesion.planning.fallback import fallback
 from sumo_cohesion.planning.planners import Planner, make_planner
 from sumo_cohesion.planning.settings import PlannerSettings
 from sumo_cohesion.social.features import social_features
+from sumo_cohesion.social.settings import new_habit
 from sumo_cohesion.state import CartesianState, Observation, Plan, Scene
 from sumo_cohesion.traffic.contact import contacts
 from sumo_cohesion.traffic.drivers import Drivers
@@ -79,7 +80,9 @@ def simulate(setup: Setup, planner: Planner, *, gui: bool = False) -> Rollout:
     sensing, size = scenario.sensing, (scenario.ego.length, scenario.ego.width)
     sensor = Sensor(road, sensing.range, sensing.hidden, sensing.special)
     memory = setup.cohesion.interval, setup.cohesion.memory
-    history = History(STEP_LENGTH, *memory, describe=social_features)
+    history = History(
+        STEP_LENGTH, *memory, describe=social_features, habit=lambda: new_habit(setup.cohesion)
+    )
     recorder = Recorder(setup, sensor)
     planner.reset(road)
     with (

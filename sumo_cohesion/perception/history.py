@@ -12,11 +12,11 @@ from collections import deque
 from collections.abc import Callable, Collection, Sequence
 from math import atan2
 
+from sumo_cohesion.perception.habit import Features, Habit
 from sumo_cohesion.state import Observation
 
 State = tuple[float, float, float, float]
 """s, d (m), heading (rad, of the displacement), speed (m/s), in the road frame."""
-Features = tuple[float, ...]
 Describe = Callable[[State, State, float, float], Features]
 """Features of a transition: (before, after, seconds between, road curvature)."""
 
@@ -29,13 +29,25 @@ class Track:
     voter : False for special vehicles, which nobody follows.
     state : where the car was seen last.
     step : when it was seen last, in steps.
-    steps, middle_s, middle_d, features : of each remembered transition: the step it ended in,
-        its middle (m), and its features.
+    steps, middle_s, middle_d, features, habits : of each remembered transition: the step it
+        ended in, its middle (m), its features, and the variance of the same features in this
+        car's own past (see Habit).
     """
 
-    __slots__ = ("_recent", "features", "middle_d", "middle_s", "state", "step", "steps", "voter")
+    __slots__ = (
+        "_habit",
+        "_recent",
+        "features",
+        "habits",
+        "middle_d",
+        "middle_s",
+        "state",
+        "step",
+        "steps",
+        "voter",
+    )
 
-    def __init__(self, lag: int) -> None:
+    def __init__(self, lag: int, habit: Habit) -> None:
         self.voter = True
         self.step = -2
         self.state: State = (0.0, 0.0, 0.0, 0.0)
@@ -43,6 +55,8 @@ class Track:
         self.middle_s: list[float] = []
         self.middle_d: list[float] = []
         self.features: list[Features] = []
+        self.habits: list[Features] = []
+        self._habit = habit
         self._recent: deque[State] = deque(maxlen=lag + 1)
 
     def see(
@@ -74,6 +88,8 @@ class Track:
             self.middle_s.append(0.5 * (start[0] + s))
             self.middle_d.append(0.5 * (start[1] + d))
             self.features.append(describe(start, state, interval, curvature))
+            self._habit.see(self.features)
+            self.habits.append(self._habit.variance)
 
     def newest(self) -> Features | None:
         """Features of the transition that ended when the car was seen last."""
@@ -94,12 +110,49 @@ class Track:
         d0, d1 = self.middle_d[after - 1], self.middle_d[after]
         return d0 + (d1 - d0) * (s - s0) / (s1 - s0)
 
+    def habit_at(self, s: float) -> Features:
+        """Variance of the car's features in its own past when it passed s."""
+        return self.habits[min(bisect_right(self.middle_s, s), len(self.habits) - 1)]
+
     def forget(self, before: int) -> None:
         """Drop transitions that ended before a step."""
         old = bisect_left(self.steps, before)
         if old:
-            for series in (self.steps, self.middle_s, self.middle_d, self.features):
+            for series in (
+                self.steps,
+                self.middle_s,
+                self.middle_d,
+                self.features,
+                self.habits,
+            ):
                 del series[:old]
+
+
+class Path:
+    """Where across the road the ego drove, by place; bounded."""
+
+    def __init__(self, length: int) -> None:
+        self._length = length
+        self._s: list[float] = []
+        self._d: list[float] = []
+
+    def add(self, s: float, d: float) -> None:
+        """Add the present place, if it is a new one."""
+        if self._s and s <= self._s[-1]:
+            return
+        self._s.append(s)
+        self._d.append(d)
+        if len(self._s) > 2 * self._length:  # seldom, so that dropping the old half is cheap
+            del self._s[: self._length], self._d[: self._length]
+
+    @property
+    def first(self) -> float:
+        """Farthest place back (m) that is known."""
+        return self._s[0]
+
+    def at(self, s: float) -> float:
+        """Where across the road (m) the ego was at the known place nearest ahead of s."""
+        return self._d[min(bisect_left(self._s, s), len(self._d) - 1)]
 
 
 class History:
@@ -111,22 +164,33 @@ class History:
     interval : seconds that one transition spans (a multiple of step).
     memory : seconds to remember.
     describe : what to remember of a transition; the runner gives the social features.
+    habit : makes what is known of a driver before anything is known of it.
     """
 
-    def __init__(self, step: float, interval: float, memory: float, describe: Describe) -> None:
+    def __init__(
+        self,
+        step: float,
+        interval: float,
+        memory: float,
+        describe: Describe,
+        habit: Callable[[], Habit],
+    ) -> None:
         self._step_length = step
         self._lag = max(round(interval / step), 1)
         self._interval = self._lag * step
         self._memory = round(memory / step)
         self._describe = describe
+        self._habit = habit
         self._now = -1
         self._tracks: dict[str, Track] = {}
         self._in_sight: list[Track] = []
+        self.ego_path = Path(self._memory)
 
     def push(self, observation: Observation) -> None:
         """Remember one observation; call it once per step."""
         self._now += 1
         self._forget()
+        self.ego_path.add(observation.ego.s, observation.ego.d)
         rows: Sequence[State] = observation.states.tolist()
         in_sight = []
         for name, state, curvature, voter in zip(
@@ -138,7 +202,7 @@ class History:
         ):
             track = self._tracks.get(name)
             if track is None:
-                track = self._tracks[name] = Track(self._lag)
+                track = self._tracks[name] = Track(self._lag, self._habit())
             track.voter = voter
             track.see(
                 self._now,

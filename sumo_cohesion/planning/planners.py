@@ -78,6 +78,7 @@ class CohesivePlanner:
         if self._mpc is None or self._mpc.n_lanes != n_lanes:
             self._mpc = Mpc(self.settings, n_lanes)
         self._mpc.reset()
+        self._surprised_until = -1.0
 
     def plan(self, observation: Observation, history: History) -> Plan:
         """Plan one step, in the paper's order."""
@@ -102,10 +103,16 @@ class CohesivePlanner:
         groups = agree(group_votes(ego, history, road, cohesion), cohesion)
         place = NOWHERE
         if cohesion.place_weight > 0.0:
-            ahead = [ego.s + DT * ego.speed * t for t in self._place_steps]
-            place = agree_on_place(ego, history, road, ahead, cohesion)
+            times = [DT * t for t in self._place_steps]
+            place = agree_on_place(ego, history, road, times, cohesion)
         if cohesion.lateral_votes == "most_surprising":
-            groups, place = elect_lateral(groups, place, cohesion.surprise)
+            now = observation.time
+            held = now < self._surprised_until
+            groups, place, surprise = elect_lateral(
+                groups, place, 1.0 if held else cohesion.surprise
+            )
+            if surprise > cohesion.surprise:
+                self._surprised_until = now + cohesion.surprise_hold
         return groups, place
 
     def _problem(
@@ -132,7 +139,7 @@ class CohesivePlanner:
             stages = np.arange(1, horizon + 1)
             place_weight = np.interp(stages, self._place_steps, place.weight)
             place_weight *= self.cohesion.beta / PLACE_SCALE**2
-            place_target = np.interp(stages, self._place_steps, place.mean)
+            place_target = np.interp(stages, self._place_steps, place.target)
         return Problem(
             ego=np.array(ego),
             ego_width=np.array([observation.ego_size[1]]),
@@ -225,12 +232,13 @@ def explain(
         for name, m, v, w, o in zip(FEATURES, g.mean, g.variance, g.weight, own, strict=True)
     ]
     if place.n:
-        mean, variance, weight = place.mean[0] / PLACE_SCALE, place.variance[0], place.weight[0]
-        pull = beta * weight * (mean - d / PLACE_SCALE) ** 2
+        mean, here, weight = place.mean / PLACE_SCALE, d / PLACE_SCALE, max(place.weight)
+        pull = beta * sum(
+            w * ((target - d) / PLACE_SCALE) ** 2
+            for w, target in zip(place.weight, place.target, strict=True)
+        )
         rows.append(
-            AgreementRow(
-                "position", "place", place.n, mean, variance, weight, d / PLACE_SCALE, pull
-            )
+            AgreementRow("position", "place", place.n, mean, place.variance, weight, here, pull)
         )
     return tuple(rows)
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from sumo_cohesion.perception.history import Features
+from sumo_cohesion.perception.habit import Features
 from sumo_cohesion.social.features import FEATURES, LATERAL
-from sumo_cohesion.social.groups import Votes
+from sumo_cohesion.social.groups import Vote, Votes
 from sumo_cohesion.social.place import Place
 from sumo_cohesion.social.settings import CohesionSettings
 
@@ -44,25 +44,54 @@ def agree(votes: Votes, settings: CohesionSettings) -> tuple[Agreement, ...]:
     return tuple([_agree(group, cast, settings) for group, cast in votes.items()])
 
 
-def _agree(group: str, votes: Sequence[Features], settings: CohesionSettings) -> Agreement:
+def _agree(group: str, votes: Sequence[Vote], settings: CohesionSettings) -> Agreement:
     n = len(votes)
     if n < settings.min_cars:
         return Agreement(group, n, _ZEROS, _ZEROS, _ZEROS)
-    columns = list(zip(*votes, strict=True))
-    mean = tuple([sum(column) / n for column in columns])
-    variance = tuple(
+    features, habits = zip(*votes, strict=True)
+    values = list(zip(*features, strict=True))
+    if settings.habit > 0.0:
+        columns = [
+            _with_habit(column, habit, settings.variance_floor)
+            for column, habit in zip(values, zip(*habits, strict=True), strict=True)
+        ]
+    else:
+        columns = [_plain(column, settings.variance_floor) for column in values]
+    mean, variance, weight = zip(*columns, strict=True)
+    weight = tuple(
         [
-            sum([(value - m) * (value - m) for value in column]) / (n - 1)
-            for column, m in zip(columns, mean, strict=True)
+            w if lateral else w * settings.speed_weight
+            for w, lateral in zip(weight, LATERAL, strict=True)
         ]
     )
-    weight = tuple([1.0 / (v + settings.variance_floor) for v in variance])
     return Agreement(group, n, mean, variance, weight)
+
+
+def _plain(values: Sequence[float], floor: float) -> tuple[float, float, float]:
+    n = len(values)
+    mean = sum(values) / n
+    variance = sum([(value - mean) * (value - mean) for value in values]) / (n - 1)
+    return mean, variance, 1.0 / (variance + floor)
+
+
+def _with_habit(
+    values: Sequence[float], habits: Sequence[float], floor: float
+) -> tuple[float, float, float]:
+    """Mean, variance and weight of one feature, each driver counting by its own reliability."""
+    n = len(values)
+    precision = [1.0 / (floor + habit) for habit in habits]
+    total = sum(precision)
+    mean = sum([q * value for q, value in zip(precision, values, strict=True)]) / total
+    spread = sum(
+        [q * (value - mean) * (value - mean) for q, value in zip(precision, values, strict=True)]
+    )
+    variance = spread / total * n / (n - 1) + n / total - floor
+    return mean, variance, 1.0 / (variance + floor)
 
 
 def elect_lateral(
     groups: Sequence[Agreement], place: Place, threshold: float
-) -> tuple[tuple[Agreement, ...], Place]:
+) -> tuple[tuple[Agreement, ...], Place, float]:
     """Let only the most surprising group vote on lateral features, and none if nothing surprises.
 
     Once humans have finished a swerve they all drive straight, and their unanimous "straight"
@@ -91,7 +120,7 @@ def elect_lateral(
     )
     if chosen < 0 or groups[chosen].group != "position":
         place = place._replace(weight=(0.0,) * len(place.weight))
-    return elected, place
+    return elected, place, most
 
 
 def combine(groups: Sequence[Agreement]) -> CohesionTerm:

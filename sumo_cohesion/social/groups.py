@@ -6,16 +6,26 @@ Every car has one vote in a group: the mean of the transitions it contributes.
 from __future__ import annotations
 
 from math import pi
+from typing import NamedTuple
 
-from sumo_cohesion.perception.history import Features, History, Track
+from sumo_cohesion.perception.habit import Features
+from sumo_cohesion.perception.history import History, Track
 from sumo_cohesion.road import Road
 from sumo_cohesion.social.settings import CohesionSettings
 from sumo_cohesion.state import RoadState
 
 GROUPS = ("position", "lane", "road")
 
-Votes = dict[str, list[Features]]
-"""By group: the normalised social features that each of its cars votes for."""
+
+class Vote(NamedTuple):
+    """One car's normalised social features, and their variance in its own past."""
+
+    features: Features
+    habit: Features
+
+
+Votes = dict[str, list[Vote]]
+"""By group: what each of its cars votes for."""
 
 
 def group_votes(ego: RoadState, history: History, road: Road, settings: CohesionSettings) -> Votes:
@@ -31,10 +41,11 @@ def group_votes(ego: RoadState, history: History, road: Road, settings: Cohesion
             votes["position"].append(vote)
     own_lane = road.lane_of(ego.s, ego.d)
     for track in history.in_sight():
-        vote = track.newest() if track.voter else None
+        newest = track.newest() if track.voter else None
         s, d, heading, _ = track.state
-        if vote is None or abs(heading) > pi / 2:
+        if newest is None or abs(heading) > pi / 2:
             continue  # oncoming traffic is nobody to follow
+        vote = Vote(newest, track.habits[-1])
         ahead = s - ego.s
         if abs(ahead) <= settings.road_reach:
             votes["road"].append(vote)
@@ -44,15 +55,18 @@ def group_votes(ego: RoadState, history: History, road: Road, settings: Cohesion
     return votes
 
 
-def _vote_at_place(track: Track, ego: RoadState, settings: CohesionSettings) -> Features | None:
+def _vote_at_place(track: Track, ego: RoadState, settings: CohesionSettings) -> Vote | None:
     """Mean features of one car's transitions around the ego's place; None if it kept aside."""
     passed = track.passed(ego.s, settings.position_length)
     samples = [
-        features
-        for features, d in zip(track.features[passed], track.middle_d[passed], strict=True)
+        (features, habit)
+        for features, habit, d in zip(
+            track.features[passed], track.habits[passed], track.middle_d[passed], strict=True
+        )
         if abs(d - ego.d) <= settings.position_width
     ]
     if not samples:
         return None
+    features, habits = zip(*samples, strict=True)
     n = len(samples)
-    return tuple([sum(column) / n for column in zip(*samples, strict=True)])
+    return Vote(tuple([sum(column) / n for column in zip(*features, strict=True)]), habits[0])
