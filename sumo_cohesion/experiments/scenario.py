@@ -61,6 +61,7 @@ class Scenario(_Data):
         bundled ones.
     duration : seconds after the ego's departure.
     lateral_resolution : width (m) of SUMO's sublanes.
+    human_type : SUMO vType attributes, set on the types of all humans.
     events : what humans are told, and when, where SUMO has no such rule.
     success : each key a metric, each value what it must be: a value or {min, max}.
     """
@@ -75,6 +76,7 @@ class Scenario(_Data):
     ego: EgoDemand
     sensing: Sensing = Sensing()
     randomize: Randomization = Randomization()
+    human_type: dict[str, float | str] = {}
     events: tuple[Event, ...] = ()
     success: dict[str, bool | float | Bounds]
     _folder: Path = PrivateAttr(default=Path())
