@@ -118,6 +118,11 @@ METRICS = (
     Column("nominal_speed_deviation", "float64", "m/s", "as twin, but from nominal's own run"),
     Column("emergency_delay", "float64", "s", "lost by the special vehicle since the first event"),
     Column("yield_time", "float64", "s", "from the first event to the ego being half a lane right"),
+    Column("passing_lane", "float64", "", "ego's lane as the special vehicle passes; NaN if never"),
+    Column("passing_shift", "float64", "m", "ego's way to the left from its start until then"),
+    Column(
+        "aside_share", "float64", "", "ego's way aside over that of its lane's humans; see docs"
+    ),
     Column("lane_changes", "int64", "", "changes of the ego's nearest lane"),
     Column("min_gap", "float64", "m", "smallest bumper-to-bumper gap to a car ahead in its path"),
     Column("min_ttc", "float64", "s", "smallest time to collision; NaN if never closing in"),

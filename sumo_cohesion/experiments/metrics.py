@@ -51,6 +51,8 @@ def run_metrics(
         "speed_gap_closed": speed_gap_closed(ego, others, plan),
         **reference_metrics(ego, reference),
         **emergency_metrics(info, ego, others),
+        **passing_metrics(info, ego, others),
+        "aside_share": aside_share(info, ego, others),
         "max_lateral_shift": float((ego["d"] - ego["d"].iloc[0]).abs().max()),
         "max_speed_shift": max_speed_shift(ego, plan),
         "lane_changes": int((np.diff(ego["lane"]) != 0).sum()),
@@ -174,6 +176,61 @@ def emergency_metrics(
         "emergency_delay": passed - driven / float(vehicle["speed"].max()),
         "yield_time": float(aside["time"].iloc[0] - event) if len(aside) else np.nan,
     }
+
+
+def passing_metrics(
+    info: Mapping[str, Any], ego: pd.DataFrame, others: pd.DataFrame
+) -> dict[str, float]:
+    """Where the ego is at the step in which the special vehicle, until then behind, is ahead.
+
+    passing_lane: its lane; passing_shift: its d (m, left positive) less that at its start. NaN
+    if it is never passed.
+    """
+    nothing = {"passing_lane": np.nan, "passing_shift": np.nan}
+    if not info["special"]:
+        return nothing
+    vehicle = others[others["vehicle"] == info["special"][0]]
+    both = ego.merge(vehicle[["time", "s"]], on="time", suffixes=("", "_special"))
+    ahead = (both["s_special"] > both["s"]).to_numpy()
+    passes = np.flatnonzero(~ahead[:-1] & ahead[1:])
+    if not passes.size:
+        return nothing
+    then = both.iloc[passes[0] + 1]
+    return {
+        "passing_lane": float(then["lane"]),
+        "passing_shift": float(then["d"] - ego["d"].iloc[0]),
+    }
+
+
+def aside_share(info: Mapping[str, Any], ego: pd.DataFrame, others: pd.DataFrame) -> float:
+    """How far the ego moved aside for the special vehicle, as a share of what humans did.
+
+    A car's way aside is its d when the special vehicle is nearest to it along the road (as it
+    passes, if it does) less its d at the start. The ego's is divided by the mean of the humans
+    that started in the ego's lane: 0 is staying put, 1 doing as they did, negative the other way.
+    Each car at its own moment, because a siren reaches one after the other; the ego's lane alone,
+    because other lanes may move the other way. NaN without a special vehicle or such humans, or
+    if these moved by less than 0.3 m.
+    """
+    if not info["special"]:
+        return np.nan
+    special = others[others["vehicle"] == info["special"][0]]
+    not_human = [*info["hidden"], *info["special"]]
+    start = others[others["time"] == ego["time"].iloc[0]]
+    lane = start["lane"] == ego["lane"].iloc[0]
+    names = start["vehicle"][lane & ~start["vehicle"].isin(not_human)]
+    ways = [_way_aside(others[others["vehicle"] == name], special) for name in names]
+    mean = float(np.mean(ways)) if ways else np.nan
+    return _way_aside(ego, special) / mean if abs(mean) >= 0.3 else np.nan
+
+
+def _way_aside(car: pd.DataFrame, special: pd.DataFrame) -> float:
+    """Way to the left (m) from a car's start to when the special vehicle is nearest along s."""
+    both = car.merge(special[["time", "s"]], on="time", suffixes=("", "_special"))
+    if both.empty:
+        return np.nan
+    nearest = (both["s_special"] - both["s"]).abs().argmin()
+    return float(both["d"].iloc[nearest] - car["d"].iloc[0])
 
 
 def gap_metrics(ego: pd.DataFrame, others: pd.DataFrame) -> dict[str, float]:

@@ -61,6 +61,7 @@ class Scenario(_Data):
         bundled ones.
     duration : seconds after the ego's departure.
     lateral_resolution : width (m) of SUMO's sublanes.
+    human_type : SUMO vType attributes, set on the types of all humans.
     events : what humans are told, and when, where SUMO has no such rule.
     reference : also drive a nominal twin beside the ego, for the metrics that compare with it
         (experiments.reference); it costs two more plans per step.
@@ -77,6 +78,7 @@ class Scenario(_Data):
     ego: EgoDemand
     sensing: Sensing = Sensing()
     randomize: Randomization = Randomization()
+    human_type: dict[str, float | str] = {}
     events: tuple[Event, ...] = ()
     reference: bool = False
     success: dict[str, bool | float | Bounds]

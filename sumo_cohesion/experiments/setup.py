@@ -13,7 +13,12 @@ from sumo_cohesion.planning.planners import cohesion_of, make_planner
 from sumo_cohesion.planning.settings import PlannerSettings
 from sumo_cohesion.road import Road
 from sumo_cohesion.social.settings import CohesionSettings
-from sumo_cohesion.traffic.demand import build_demand, check_demand, write_demand
+from sumo_cohesion.traffic.demand import (
+    build_demand,
+    check_demand,
+    check_human_type,
+    write_demand,
+)
 from sumo_cohesion.traffic.network import Network
 from sumo_cohesion.traffic.simulator import SumoRun
 
@@ -42,7 +47,13 @@ class Setup:
         """Write this seed's demand and return what SUMO needs."""
         scenario = self.scenario
         demand = build_demand(
-            self.routes, self.route, scenario.ego, scenario.randomize, self.not_human, self.seed
+            self.routes,
+            self.route,
+            scenario.ego,
+            scenario.randomize,
+            scenario.human_type,
+            self.not_human,
+            self.seed,
         )
         return SumoRun(
             network=self.network,
@@ -79,6 +90,7 @@ def prepare(
     named = {*loaded.sensing.hidden, *loaded.sensing.special}
     for event in loaded.events:
         named |= {*event.who} | ({event.near} if event.near else set())
+    check_human_type(loaded.human_type)
     route = check_demand(network, routes, loaded.ego, named)
     return Setup(
         scenario=loaded,

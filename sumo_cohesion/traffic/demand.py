@@ -5,8 +5,9 @@ SUMO's demand format: https://sumo.dlr.de/docs/Definition_of_Vehicles,_Vehicle_T
 
 from __future__ import annotations
 
+import difflib
 import xml.etree.ElementTree as ET
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from math import isfinite
 from pathlib import Path
 from typing import Annotated
@@ -15,11 +16,14 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from sumo_cohesion.errors import UserError
+from sumo_cohesion.traffic.library import vehicle_type_attributes
 from sumo_cohesion.traffic.network import Network, check_xml
 
 EGO = "ego"
 """Id of the ego vehicle and of its vehicle type in SUMO."""
 DEMAND_FILE = "demand.rou.xml"
+_DEFAULT_TYPE = "DEFAULT_VEHTYPE"
+"""SUMO's type of a vehicle that names none."""
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
@@ -115,11 +119,27 @@ def check_demand(
 def _require_finite(path: Path, element: ET.Element) -> None:
     """Reject nan and inf: SUMO takes them without a word and simulates nonsense."""
     for key, text in element.attrib.items():
-        if key != "id" and text.strip().lower().lstrip("+-") in ("nan", "inf", "infinity"):
+        if key != "id" and _not_finite(text):
             raise UserError(
                 f"{path}: {key} = {text!r} of {element.tag} {element.get('id', '')!r} is not a "
                 "finite number"
             )
+
+
+def _not_finite(text: str) -> bool:
+    return text.strip().lower().lstrip("+-") in ("nan", "inf", "infinity")
+
+
+def check_human_type(attributes: Mapping[str, float | str]) -> None:
+    """Check names and numbers of vType attributes: SUMO ignores a misspelt one without a word."""
+    known = vehicle_type_attributes() if attributes else ()
+    for name, value in attributes.items():
+        if known and name not in known:
+            close = difflib.get_close_matches(name, known, n=1)
+            hint = f"; did you mean {close[0]!r}?" if close else ""
+            raise UserError(f"human_type: SUMO's vehicle types have no attribute {name!r}{hint}")
+        if _not_finite(str(value)):
+            raise UserError(f"human_type.{name} = {value} is not a finite number")
 
 
 def build_demand(
@@ -127,17 +147,21 @@ def build_demand(
     route: Sequence[str],
     ego: EgoDemand,
     randomization: Randomization,
+    human_type: Mapping[str, float | str],
     fixed: Collection[str],
     seed: int,
 ) -> ET.Element:
     """Merge route files and the ego into one <routes>, varied by the seed.
 
-    ``fixed`` are vehicles that are not humans (stalled cars, an ambulance): always kept, their
-    speed unchanged. The same seed always gives the same demand.
+    ``human_type`` are vType attributes for the types of all humans. ``fixed`` are vehicles that
+    are not humans (stalled cars, an ambulance): always kept, their speed unchanged. The same
+    seed always gives the same demand.
     """
     merged = ET.Element("routes")
     for path in route_files:
         merged.extend(check_xml(path, "routes"))
+    if human_type:
+        _set_human_type(merged, human_type, fixed)
     rng = np.random.default_rng(seed)
     others = [v for v in merged if v.tag == "vehicle"]
     humans = [v for v in others if v.get("id") not in fixed]
@@ -175,6 +199,31 @@ def write_demand(demand: ET.Element, folder: Path) -> Path:
     ET.indent(demand)
     ET.ElementTree(demand).write(path, encoding="UTF-8", xml_declaration=True)
     return path
+
+
+def _set_human_type(
+    routes: ET.Element, attributes: Mapping[str, float | str], fixed: Collection[str]
+) -> None:
+    """Set attributes on every vehicle type that a human has; types of others stay as they are."""
+    kinds = {
+        v.get("type", _DEFAULT_TYPE)
+        for v in routes
+        if v.tag in ("vehicle", "trip", "flow") and v.get("id") not in fixed
+    }
+    for distribution in routes.iter("vTypeDistribution"):
+        if distribution.get("id") in kinds:
+            kinds.discard(distribution.get("id", ""))
+            kinds |= set((distribution.get("vTypes") or "").split())
+            kinds |= {kind.get("id", "") for kind in distribution.iter("vType")}
+    types = {kind.get("id", ""): kind for kind in routes.iter("vType")}
+    for name in sorted(kinds):
+        if name == _DEFAULT_TYPE and name not in types:
+            types[name] = ET.Element("vType", id=name)
+            routes.insert(0, types[name])
+        if name not in types:
+            raise UserError(f"human_type: no route file has the vehicle type {name!r}")
+        for key, value in attributes.items():
+            types[name].set(key, value if isinstance(value, str) else f"{value:.10g}")
 
 
 def _leads(humans: Sequence[ET.Element], ego: EgoDemand) -> list[ET.Element]:

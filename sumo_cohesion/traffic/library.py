@@ -7,7 +7,9 @@ import os
 import shutil
 import sys
 import tempfile
+import xml.etree.ElementTree as ET
 from collections.abc import Iterator
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -55,6 +57,19 @@ def _quiet_import() -> Iterator[None]:
             del os.environ["LIBSUMO_AS_TRACI"]
         else:
             os.environ["LIBSUMO_AS_TRACI"] = before
+
+
+def vehicle_type_attributes() -> frozenset[str]:
+    """Names of SUMO's vType attributes, from the schema that comes with libsumo; empty if none."""
+    try:
+        schema = resources.files("sumo_data") / "data" / "xsd" / "types" / "route.xsd"
+        root = ET.fromstring(schema.read_text(encoding="utf-8"))
+    except (ImportError, OSError, ET.ParseError):
+        return frozenset()
+    xsd = "{http://www.w3.org/2001/XMLSchema}"
+    kind = root.find(f"{xsd}complexType[@name='vTypeBaseType']")
+    found = () if kind is None else kind.iter(f"{xsd}attribute")
+    return frozenset(attribute.get("name", "") for attribute in found)
 
 
 def sumo_version(libsumo: Any) -> tuple[int, int]:

@@ -26,6 +26,7 @@ _POSITION_TOLERANCE = 0.05
 """Metres by which SUMO's ego may differ from the driven one. Measured: below 0.001."""
 _KEEP_ROUTE_EXACT = 2
 """moveToXY: put the ego exactly there, map it to whatever lane is below, or to none."""
+_SPEED_FACTOR = 3.0
 
 _running: str | None = None
 
@@ -97,7 +98,6 @@ class Simulator:
         self._sizes: dict[str, tuple[float, float]] = {}
         self._driven: CartesianState | None = None
         self._stepped = True
-        self._taken_over = False
         self._sumo: Any = None
         self._variables: tuple[int, ...] = ()
 
@@ -158,26 +158,27 @@ class Simulator:
         return self.read()
 
     def _take_over(self) -> None:
-        """Switch off SUMO's own control of the ego.
+        """Switch off SUMO's own control of the ego, unless it is off.
 
         A high speed factor matters: SUMO reports an ego moved faster than its lane's limit
-        times that factor at the capped speed, and humans follow what is reported.
+        times that factor at the capped speed, and humans follow what is reported. SUMO's
+        bluelight device takes the factor away again from a car that it no longer influences.
         """
+        if self._sumo.vehicle.getSpeedFactor(EGO) == _SPEED_FACTOR:
+            return
         vehicle = self._sumo.vehicle
         # In this order: setMaxSpeed gives the ego a type of its own, with speed factor 1.
         vehicle.setMaxSpeed(EGO, 70.0)
-        vehicle.setSpeedFactor(EGO, 3.0)
+        vehicle.setSpeedFactor(EGO, _SPEED_FACTOR)
         vehicle.setSpeedMode(EGO, 0)
         vehicle.setLaneChangeMode(EGO, 0)
-        self._taken_over = True
 
     def step(self, ego: CartesianState | None) -> None:
         """Advance SUMO by one step, with the ego at the given state (None: SUMO drives it)."""
         if ego is not None:
             if not all(map(isfinite, ego)):
                 raise SimulationError(f"the ego would be moved to a place that is no number: {ego}")
-            if not self._taken_over:
-                self._take_over()
+            self._take_over()
             # SUMO's angles are degrees clockwise from north; its positions are front bumpers.
             half = self._ego_size[0] / 2
             front = ego.x + half * cos(ego.heading), ego.y + half * sin(ego.heading)

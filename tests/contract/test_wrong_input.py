@@ -91,6 +91,10 @@ ROUTES = (ROOT / "routes" / "stalled.rou.xml").read_text()
         ("distance = { min = 620.0 }", "distance = { least = 620.0 }", ["success.distance"]),
         ("humans = [3, 7]", "humans = [7, 3]", ["randomize", "low <= high"]),
         ("speed = 0.02", "speed = 2.0", ["randomize.speed"]),
+        ("[success]", "[human_type]\nlcSigmo = 1\n[success]", ["'lcSigmo'", "'lcSigma'"]),
+        ("[success]", "[human_type]\nlcSigma = nan\n[success]", ["human_type.lcSigma", "finite"]),
+        ("[success]", "[human_type]\nlcSigma = 'x'\n[success]", ["lcSigma"]),
+        ("[success]", "[human_type]\nlcSigma = [1]\n[success]", ["human_type.lcSigma", "number"]),
         ("[ego]", "[ego", ["not valid TOML"]),
     ],
 )

@@ -77,6 +77,28 @@ def test_the_ego_is_where_it_was_put_at_the_speed_it_was_driven(tmp_path: Path) 
         assert reported[101:] == pytest.approx([0.0] * 99, abs=0.01)
 
 
+def test_a_siren_leaves_the_reported_speed_alone(tmp_path: Path) -> None:
+    siren = (
+        '<vType id="siren" vClass="emergency" laneChangeModel="SL2015" maxSpeed="10">'
+        '<param key="has.bluelight.device" value="true"/>'
+        '<param key="device.bluelight.reactiondist" value="60"/>'
+        '<param key="device.bluelight.reaction-prob-far" value="10"/></vType>'
+    )
+    behind = vehicle("behind", 1, 900, 10).replace('type="car"', 'type="siren"')
+    with simulation(tmp_path, siren, behind, vehicle("ego", 1, 940, 25)) as sumo:
+        ego = sumo.insert_ego(latest=5.0).ego
+        reported, influenced = [], []
+        for _ in range(60):
+            ego = CartesianState(ego.x + 4.5, ego.y, 0.0, 45.0)
+            sumo.step(ego)
+            assert sumo.read().ego == ego
+            reported.append(sumo._sumo.vehicle.getSpeed("ego"))
+            influenced.append(sumo._sumo.vehicle.getParameter("ego", "rescueLane") == "behind")
+    assert any(influenced)
+    assert not influenced[-1]  # SUMO has given the ego its type back by now
+    assert reported[30:] == pytest.approx([45.0] * 30, abs=0.05)
+
+
 def test_an_ego_beside_the_road_is_still_where_it_was_put(tmp_path: Path) -> None:
     with simulation(tmp_path, vehicle("ego", 1, 100, 25), vehicle("b", 2, 160, 20)) as sumo:
         ego = sumo.insert_ego(latest=5.0).ego

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pandas as pd
 import pytest
 
 from sumo_cohesion import run
@@ -43,3 +44,36 @@ def test_ambulance_nominal_holds_it_up_and_cohesive_makes_way() -> None:
 def test_same_speed_only_the_speed_is_followed() -> None:
     row = run("same_speed", "cohesive", 1000).metrics.iloc[0]
     assert row["success"]
+
+
+def test_rescue_lane_nominal_blocks_it_and_cohesive_lets_the_ambulance_through() -> None:
+    nominal = run("ambulance_rescue_lane", "nominal", 1000)
+    cohesive = run("ambulance_rescue_lane", "cohesive", 1000)
+    sumo = run("ambulance_rescue_lane", "sumo", 1000)
+    row = cohesive.metrics.iloc[0]
+    assert row["success"]
+    assert row["passing_lane"] == 2
+    assert 0.4 < row["passing_shift"] < 0.85
+    assert abs(nominal.metrics["aside_share"].iloc[0]) < 0.1
+    assert pd.isna(nominal.metrics["passing_lane"].iloc[0])
+    assert sumo.metrics["aside_share"].iloc[0] == pytest.approx(1.0, abs=0.05)
+    # Nobody was told anything: the lane is SUMO's own, left cars left, all others right.
+    assert nominal.info["events"] == {}
+    level = cohesive.trajectory[cohesive.trajectory["time"].round(1) == 25.0].set_index("vehicle")
+    for name, lane, way in (("left_1", 7.0, 0.85), ("middle_1", 3.5, -0.85), ("right_1", 0, -0.85)):
+        assert level.loc[name, "d"] == pytest.approx(lane + way, abs=0.05)
+
+
+def test_noise_disperses_the_humans_and_cohesive_still_follows_them() -> None:
+    def straight(level: float) -> pd.Series:
+        changes = {"human_type.lcSigma": level}
+        cars = run("stalled_noise", "nominal", 1000, overrides=changes).trajectory
+        humans = cars[cars["vehicle"].str.startswith("lead")]
+        assert humans["vehicle"].nunique() == 3
+        return humans[humans["s"].between(350.0, 560.0)]["d"]
+
+    assert straight(0.0).std() < 0.001
+    assert 0.03 < straight(0.3).std() < straight(0.6).std()
+    noisy = run("stalled_noise", "cohesive", 1000)
+    assert noisy.metrics["success"].iloc[0]
+    assert noisy.info["scenario"]["human_type"] == {"lcSigma": 0.3}

@@ -159,6 +159,72 @@ def test_emergency_delay_and_yield_time_by_hand() -> None:
     assert all(np.isnan(v) for v in nothing.values())
 
 
+RESCUE = {"special": ["ambulance"], "hidden": ["stalled"]}
+
+
+def test_passing_is_the_first_step_with_the_special_vehicle_ahead() -> None:
+    ego = car("ego", 100.0 + 20.0 * TIME, d=7.0)
+    ego["d"] = 7.0 + 0.2 * TIME
+    ego["lane"] = np.where(TIME < 2.0, 2, 1)
+    ambulance = car("ambulance", 79.5 + 30.0 * TIME, d=5.25)  # level with the ego after 2.05 s
+    result = metrics.passing_metrics(RESCUE, ego, ambulance)
+    assert result["passing_lane"] == 1.0
+    assert result["passing_shift"] == pytest.approx(0.2 * 2.1)
+
+
+def test_nobody_is_passed_by_a_special_vehicle_ahead_behind_or_missing() -> None:
+    ego = car("ego", 100.0 + 20.0 * TIME)
+    ahead = car("ambulance", 101.0 + 30.0 * TIME)
+    behind = car("ambulance", 90.0 + 20.0 * TIME)
+    for others, info in (
+        (ahead, RESCUE),
+        (behind, RESCUE),
+        (behind.iloc[:0], RESCUE),
+        (car("human", 79.5 + 30.0 * TIME), {**RESCUE, "special": []}),
+    ):
+        result = metrics.passing_metrics(info, ego, others)
+        assert all(np.isnan(value) for value in result.values())
+
+
+def test_aside_share_compares_each_car_when_the_special_vehicle_is_nearest() -> None:
+    # The ambulance is level with the ego at 2 s, with the human ahead at 4 s.
+    ambulance = car("ambulance", 30.0 * TIME, d=5.0)
+    ego = car("ego", 20.0 + 20.0 * TIME, d=7.0)
+    ego["d"] = np.where(TIME < 1.0, 7.0, np.where(TIME < 2.05, 7.6, 9.0))
+    human = car("human", 40.0 + 20.0 * TIME, d=7.0)
+    human["d"] = np.where(TIME < 3.0, 7.0, np.where(TIME < 4.05, 7.8, 7.0))
+    other_lane = car("other", 20.0 + 20.0 * TIME, d=3.5)
+    other_lane["d"] = 3.5 - 0.2 * TIME
+    other_lane["lane"] = 1
+    stalled = car("stalled", np.full(51, 500.0), d=6.0)
+    others = pd.concat([ambulance, human, other_lane, stalled])
+    assert metrics.aside_share(RESCUE, ego, others) == pytest.approx(0.6 / 0.8)
+
+    mirrored = others.copy()
+    mirrored.loc[mirrored["vehicle"] == "human", "d"] *= -1
+    assert metrics.aside_share(RESCUE, ego, mirrored) == pytest.approx(-0.6 / 0.8)
+
+
+def test_aside_share_of_cars_never_passed_is_taken_when_it_is_nearest() -> None:
+    ambulance = car("ambulance", 25.0 * TIME)  # gains 5 m/s on both, never reaches them
+    ego, human = car("ego", 100.0 + 20.0 * TIME), car("human", 150.0 + 20.0 * TIME)
+    ego["d"], human["d"] = 0.1 * TIME, 0.2 * TIME
+    both = pd.concat([ambulance, human])
+    assert metrics.aside_share(RESCUE, ego, both) == pytest.approx(0.5)
+
+
+def test_aside_share_is_undefined_without_anybody_who_moved_aside() -> None:
+    ego, ambulance = car("ego", 20.0 + 20.0 * TIME), car("ambulance", 30.0 * TIME)
+    ego["d"] = 0.5 * TIME
+    lazy = car("human", 40.0 + 20.0 * TIME)
+    lazy["d"] = np.where(TIME < 3.0, 0.0, 0.29)
+    assert np.isnan(metrics.aside_share(RESCUE, ego, pd.concat([ambulance, lazy])))
+    assert np.isnan(metrics.aside_share(RESCUE, ego, ambulance))
+    lazy["d"] *= 2
+    assert np.isfinite(metrics.aside_share(RESCUE, ego, pd.concat([ambulance, lazy])))
+    assert np.isnan(metrics.aside_share({**RESCUE, "special": []}, ego, lazy))
+
+
 def test_speed_gap_closed_by_hand() -> None:
     time = np.round(0.1 * np.arange(201), 6)
     ego, other = car("ego", 26.5 * time), car("a", 30.0 + 27.5 * time)
