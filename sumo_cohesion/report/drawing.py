@@ -23,6 +23,8 @@ HUMAN, UNSEEN, SPECIAL, PATH = "white", "0.6", "tab:red", "0.6"
 """Faces of the other cars' boxes, and the colour of their paths."""
 JUMP = 1.0
 """Metres per step by which an edge jumps only where the ego changed from one strip to another."""
+MARGIN = 5.0
+"""Metres by which edges reach beyond the window, so that they end at its frame."""
 LANE_WIDTHS = (2.0, 5.0)
 """Metres; dividing the road by its lanes is believed only if it gives such lanes."""
 
@@ -82,7 +84,15 @@ def ending(rollout: Rollout) -> str:
     return f"collides with {info['touched'][0]}" if info["touched"] else str(info["outcome"])
 
 
-def car_box(car: pd.Series, face: str, **style: Any) -> Rectangle:
+def faded(colour: str, strength: float) -> tuple[float, float, float]:
+    """Mix a colour with white: 1 leaves it, 0 is white. What lies beneath never shows through."""
+    from matplotlib.colors import to_rgb
+
+    red, green, blue = (1.0 - strength * (1.0 - part) for part in to_rgb(colour))
+    return red, green, blue
+
+
+def car_box(car: pd.Series, face: Any, **style: Any) -> Rectangle:
     """Outline of one row of a trajectory, in the road frame: turned before it is stretched."""
     from matplotlib.patches import Rectangle
 
@@ -98,15 +108,21 @@ def car_box(car: pd.Series, face: str, **style: Any) -> Rectangle:
     )
 
 
-def draw_cars(axis: Axes, rollout: Rollout, rows: pd.DataFrame, **style: Any) -> None:
-    """Draw a box for each row: the ego's colour, red if special, grey if the ego cannot see it."""
+def draw_cars(
+    axis: Axes, rollout: Rollout, rows: pd.DataFrame, strength: float = 1.0, zorder: float = 3.0
+) -> None:
+    """Draw a box for each row: the ego's colour, red if special, grey if the ego cannot see it.
+
+    Less ``strength``, down to 0, makes the boxes fainter.
+    """
     for _, car in rows.iterrows():
         face = HUMAN if car["visible"] else UNSEEN
         if car["vehicle"] in rollout.info["special"]:
             face = SPECIAL
         if car["vehicle"] == "ego":
             face = ego_colour(rollout)
-        axis.add_patch(car_box(car, face, **style))
+        edge = faded("black", strength)
+        axis.add_patch(car_box(car, faded(face, strength), edgecolor=edge, zorder=zorder))
 
 
 def draw_paths(axis: Axes, rollout: Rollout, rows: pd.DataFrame) -> None:
@@ -126,7 +142,7 @@ def draw_road(axis: Axes, rollouts: Sequence[Rollout], window: tuple[float, floa
     low, high = np.inf, -np.inf
     for rollout in rollouts:
         s = ego_of(rollout)["s"].iloc[: len(rollout.plan)].to_numpy()
-        inside = (s >= window[0]) & (s <= window[1])
+        inside = (s >= window[0] - MARGIN) & (s <= window[1] + MARGIN)
         for name in ("road_right", "road_left"):
             edge = rollout.plan[name].where(rollout.plan[name].diff().abs().fillna(0.0) < JUMP)
             axis.plot(s[inside], edge[inside], color="black", lw=1.2)
