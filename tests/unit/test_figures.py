@@ -201,6 +201,9 @@ def test_precision_is_one_over_variance_and_floor_where_enough_cars_vote(
     expected = 1.0 / (rows["variance"][~few] + cohesion["variance_floor"])
     assert table["distance"][~few].to_numpy() == pytest.approx(expected.to_numpy())
     assert table["distance"][few].isna().all()
+    most = {"cohesion": cohesion | {"min_cars": int(rows["n"].max())}}
+    strict = paper.precision(replace(cohesive, info=cohesive.info | most))
+    assert strict["distance"].notna().tolist() == (rows["n"] == rows["n"].max()).tolist()
     # Lateral features have a precision, though the road group has no vote on them.
     given = cohesive.agreement[cohesive.agreement["feature"] == "lateral"]
     assert (given[given["group"] == "road"]["weight"] == 0.0).any()
