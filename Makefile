@@ -5,7 +5,7 @@ NETCONVERT := $(BIN)/netconvert --offset.disable-normalization true --no-turnaro
 # Threads of the linear algebra library only cost time here: the matrices are tiny.
 export OPENBLAS_NUM_THREADS := 1
 
-.PHONY: demo test lint check format networks docs lock wheel benchmark evidence clean
+.PHONY: demo test lint check format networks docs lock wheel benchmark evidence figures clean
 
 demo: $(VENV)/.installed
 	$(BIN)/sumo-cohesion compare stalled --seeds 0:8 --out demo
@@ -46,6 +46,9 @@ lock: $(VENV)/.installed
 
 evidence: $(VENV)/.installed
 	$(BIN)/python analysis/stalled.py
+
+figures: $(VENV)/.installed
+	$(BIN)/python analysis/figures.py
 
 benchmark: $(VENV)/.installed
 	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python benchmarks/rooms.py | tee benchmarks/rooms.txt
