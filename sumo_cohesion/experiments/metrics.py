@@ -24,12 +24,14 @@ def run_metrics(
     info: Mapping[str, Any],
     trajectory: pd.DataFrame,
     plan: pd.DataFrame,
+    agreement: pd.DataFrame,
     timing: pd.DataFrame,
     reference: pd.DataFrame,
 ) -> pd.DataFrame:
     """All metrics of one run: one row, see columns.METRICS."""
     ego = trajectory[trajectory["vehicle"] == _EGO]
     others = trajectory[trajectory["vehicle"] != _EGO]
+    humans = others[~others["vehicle"].isin([*info["hidden"], *info["special"]])]
     touched = info["touched"]
     start, end = ego["time"].iloc[0], ego["time"].iloc[-1]
     distance = float(ego["s"].iloc[-1] - ego["s"].iloc[0])
@@ -49,7 +51,9 @@ def run_metrics(
         "travel_time": float(end - start),
         "mean_speed": distance / float(end - start),
         "speed_gap_closed": speed_gap_closed(ego, others, plan),
+        "speed_most_agreed": speed_most_agreed(agreement),
         **reference_metrics(ego, reference),
+        "max_excess_speed": max_excess_speed(ego, humans),
         **emergency_metrics(info, ego, others),
         **passing_metrics(info, ego, others),
         "aside_share": aside_share(info, ego, others),
@@ -60,7 +64,7 @@ def run_metrics(
         "pet": post_encroachment_time(ego, others),
         "max_jerk": max_jerk(ego),
         "max_lateral_acceleration": max_lateral_acceleration(ego),
-        **human_metrics(others, [*info["hidden"], *info["special"]]),
+        **human_metrics(humans),
         "plan_failures": int(plan["fallback"].sum()),
         "plan_ms_median": float(timing["plan_ms"].median()),
         "plan_ms_p99": float(timing["plan_ms"].quantile(0.99)),
@@ -112,10 +116,36 @@ def speed_gap_closed(ego: pd.DataFrame, others: pd.DataFrame, plan: pd.DataFrame
     return float((own["speed"].mean() - limit) / gap) if abs(gap) >= 0.5 else np.nan
 
 
+def max_excess_speed(ego: pd.DataFrame, humans: pd.DataFrame) -> float:
+    """Largest excess (m/s) of the ego's speed over the mean of the humans within 80 m.
+
+    Negative if the ego was always slower; NaN if there never was a human so near.
+    """
+    pair = humans.merge(ego[["time", "s", "speed"]], on="time", suffixes=("", "_ego"))
+    near = pair[(pair["s"] - pair["s_ego"]).abs() <= 80.0]
+    by_time = near.groupby("time")
+    return float((by_time["speed_ego"].first() - by_time["speed"].mean()).max())
+
+
 def max_speed_shift(ego: pd.DataFrame, plan: pd.DataFrame) -> float:
     """Largest difference (m/s) between the ego's speed and the limit of its route."""
     speed = ego["speed"].to_numpy()[: len(plan)]
     return float(np.abs(speed - plan["speed_limit"].to_numpy()).max())
+
+
+def speed_most_agreed(agreement: pd.DataFrame) -> float:
+    """Share of steps in which the road group's two largest precisions are those of the speed.
+
+    That is of distance and longitudinal, among all social features (paper, figure 7a). Only steps
+    in which the group has enough cars count; NaN if there are none.
+    """
+    road = agreement[(agreement["group"] == "road") & agreement["precision"].notna()]
+    by_feature = road.pivot(index="time", columns="feature", values="precision")
+    if by_feature.empty:
+        return np.nan
+    of_speed = by_feature[["distance", "longitudinal"]].min(axis=1)
+    others = by_feature.drop(columns=["distance", "longitudinal"]).max(axis=1)
+    return float((of_speed > others).mean())
 
 
 def reference_metrics(ego: pd.DataFrame, reference: pd.DataFrame) -> dict[str, float]:
@@ -307,9 +337,8 @@ def _peak(values: FloatArray) -> float:
     return float(np.abs(values).max()) if values.size else 0.0
 
 
-def human_metrics(others: pd.DataFrame, not_human: list[str]) -> dict[str, float]:
+def human_metrics(humans: pd.DataFrame) -> dict[str, float]:
     """Mean speed of the humans near the ego, and how often one began to brake hard."""
-    humans = others[~others["vehicle"].isin(not_human)]
     moved = humans.groupby("vehicle")["speed"].transform("max") > 0.1
     humans = humans[moved]
     brakes = 0

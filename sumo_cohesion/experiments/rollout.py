@@ -185,7 +185,7 @@ class Recorder:
             "n_route_lanes": setup.road.n_route_lanes,
             "versions": versions(),
         }
-        metrics = run_metrics(info, trajectory, plan, timing, reference)
+        metrics = run_metrics(info, trajectory, plan, agreement, timing, reference)
         return Rollout(info, trajectory, plan, agreement, timing, reference, metrics)
 
     def _trajectory(self, ego_size: tuple[float, float]) -> pd.DataFrame:
@@ -254,6 +254,8 @@ class Recorder:
         return np.asarray((nearest >= self._road.n_route_lanes) & (away > 3.5))
 
     def _agreement_table(self) -> pd.DataFrame:
+        cohesion = self._setup.cohesion
+        floor, least = cohesion.variance_floor, cohesion.min_cars
         rows: list[dict[str, object]] = [
             {
                 "time": time,
@@ -262,6 +264,7 @@ class Recorder:
                 "n": row.n,
                 "mean": row.mean,
                 "variance": row.variance,
+                "precision": 1.0 / (row.variance + floor) if row.n >= least else float("nan"),
                 "weight": row.weight,
                 "own": row.own,
                 "pull": row.pull,

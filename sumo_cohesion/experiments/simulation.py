@@ -23,8 +23,7 @@ from sumo_cohesion.planning import dynamics
 from sumo_cohesion.planning.fallback import fallback
 from sumo_cohesion.planning.planners import Planner, make_planner
 from sumo_cohesion.planning.settings import PlannerSettings
-from sumo_cohesion.social.features import social_features
-from sumo_cohesion.social.settings import new_habit
+from sumo_cohesion.social.memory import new_history
 from sumo_cohesion.state import CartesianState, Observation, Plan, Scene
 from sumo_cohesion.traffic.contact import contacts
 from sumo_cohesion.traffic.drivers import Drivers
@@ -79,10 +78,7 @@ def simulate(setup: Setup, planner: Planner, *, gui: bool = False) -> Rollout:
     scenario, road = setup.scenario, setup.road
     sensing, size = scenario.sensing, (scenario.ego.length, scenario.ego.width)
     sensor = Sensor(road, sensing.range, sensing.hidden, sensing.special)
-    memory = setup.cohesion.interval, setup.cohesion.memory
-    history = History(
-        STEP_LENGTH, *memory, describe=social_features, habit=lambda: new_habit(setup.cohesion)
-    )
+    history = new_history(setup.cohesion, STEP_LENGTH)
     recorder = Recorder(setup, sensor)
     planner.reset(road)
     with (

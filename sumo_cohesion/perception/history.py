@@ -36,6 +36,7 @@ class Track:
 
     __slots__ = (
         "_habit",
+        "_lag",
         "_recent",
         "features",
         "habits",
@@ -57,6 +58,7 @@ class Track:
         self.features: list[Features] = []
         self.habits: list[Features] = []
         self._habit = habit
+        self._lag = lag
         self._recent: deque[State] = deque(maxlen=lag + 1)
 
     def see(
@@ -88,7 +90,8 @@ class Track:
             self.middle_s.append(0.5 * (start[0] + s))
             self.middle_d.append(0.5 * (start[1] + d))
             self.features.append(describe(start, state, interval, curvature))
-            self._habit.see(self.features)
+            if step % self._lag == 0:  # transitions that do not overlap
+                self._habit.see(self.features[-1])
             self.habits.append(self._habit.variance)
 
     def newest(self) -> Features | None:

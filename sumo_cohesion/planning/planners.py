@@ -21,7 +21,8 @@ from sumo_cohesion.planning.dynamics import DT
 from sumo_cohesion.planning.fallback import fallback
 from sumo_cohesion.planning.settings import PlannerSettings
 from sumo_cohesion.road import Road
-from sumo_cohesion.social.agreement import Agreement, agree, combine, elect_lateral
+from sumo_cohesion.social.agreement import Agreement, agree, combine
+from sumo_cohesion.social.election import Election
 from sumo_cohesion.social.features import FEATURES, social_features
 from sumo_cohesion.social.groups import group_votes
 from sumo_cohesion.social.place import NOWHERE, Place, agree_on_place
@@ -65,6 +66,7 @@ class CohesivePlanner:
         self.settings = settings
         self.cohesion = cohesion
         self._theta = np.array(list(settings.reward.model_dump().values()))
+        self._election = Election(cohesion)
         self._mpc: Mpc | None = None
         # Where the horizon is asked for the others' place: every third step is dense enough.
         self._place_steps = list(range(1, settings.horizon + 1, 3))
@@ -78,7 +80,7 @@ class CohesivePlanner:
         if self._mpc is None or self._mpc.n_lanes != n_lanes:
             self._mpc = Mpc(self.settings, n_lanes)
         self._mpc.reset()
-        self._surprised_until = -1.0
+        self._election.reset()
 
     def plan(self, observation: Observation, history: History) -> Plan:
         """Plan one step, in the paper's order."""
@@ -106,13 +108,7 @@ class CohesivePlanner:
             times = [DT * t for t in self._place_steps]
             place = agree_on_place(ego, history, road, times, cohesion)
         if cohesion.lateral_votes == "most_surprising":
-            now = observation.time
-            held = now < self._surprised_until
-            groups, place, surprise = elect_lateral(
-                groups, place, 1.0 if held else cohesion.surprise
-            )
-            if surprise > cohesion.surprise:
-                self._surprised_until = now + cohesion.surprise_hold
+            groups, place = self._election.elect(groups, place, observation.time)
         return groups, place
 
     def _problem(
@@ -139,7 +135,7 @@ class CohesivePlanner:
             stages = np.arange(1, horizon + 1)
             place_weight = np.interp(stages, self._place_steps, place.weight)
             place_weight *= self.cohesion.beta / PLACE_SCALE**2
-            place_target = np.interp(stages, self._place_steps, place.target)
+            place_target = np.interp(stages, self._place_steps, place.mean)
         return Problem(
             ego=np.array(ego),
             ego_width=np.array([observation.ego_size[1]]),
@@ -231,14 +227,13 @@ def explain(
         for g in groups
         for name, m, v, w, o in zip(FEATURES, g.mean, g.variance, g.weight, own, strict=True)
     ]
-    if place.n:
-        mean, here, weight = place.mean / PLACE_SCALE, d / PLACE_SCALE, max(place.weight)
-        pull = beta * sum(
-            w * ((target - d) / PLACE_SCALE) ** 2
-            for w, target in zip(place.weight, place.target, strict=True)
-        )
+    if any(place.weight):
+        mean, variance, weight = place.mean[0] / PLACE_SCALE, place.variance[0], place.weight[0]
+        pull = beta * weight * (mean - d / PLACE_SCALE) ** 2
         rows.append(
-            AgreementRow("position", "place", place.n, mean, place.variance, weight, here, pull)
+            AgreementRow(
+                "position", "place", place.n, mean, variance, weight, d / PLACE_SCALE, pull
+            )
         )
     return tuple(rows)
 

@@ -340,18 +340,15 @@ def draw_nothing_to_match(nominal: Rollout, cohesive: Rollout) -> Figure:
 
 
 def precision(rollout: Rollout, group: str = "road") -> pd.DataFrame:
-    """Sample precision 1/(variance + floor) of each social feature of a group.
+    """Precision 1/(variance + floor) of each social feature of a group.
 
     Returns
     -------
     One row per time, one column per feature; NaN where fewer cars than min_cars voted. This is
     how well they agree, whether or not the group was given a vote.
     """
-    cohesion = rollout.info["cohesion"]
     rows = rollout.agreement[rollout.agreement["group"] == group]
-    value = 1.0 / (rows["variance"] + cohesion["variance_floor"])
-    value = value.where(rows["n"] >= cohesion["min_cars"])
-    table = rows.assign(precision=value).pivot(index="time", columns="feature", values="precision")
+    table = rows.pivot(index="time", columns="feature", values="precision")
     return table[[name for name in FEATURE_LABELS if name in table]]
 
 
@@ -487,7 +484,7 @@ def draw_rates(rates: pd.DataFrame) -> Figure:
     axis.xaxis.set_major_formatter(lambda x, _: f"{100 * x:.0f} %")
     runs = sorted(set(rates["n"]))
     n = str(runs[0]) if len(runs) == 1 else f"{runs[0]} to {runs[-1]}"
-    axis.set_xlabel(f"runs that succeed, of {n}, with 95 % Wilson intervals")
+    axis.set_xlabel(f"share of {n} runs, with 95 % Wilson intervals")
     axis.grid(axis="x", color="0.9", lw=0.8)
     figure.legend(loc="outside upper center", ncols=len(planners), fontsize="small", frameon=False)
     return figure

@@ -8,7 +8,6 @@ from typing import NamedTuple
 from sumo_cohesion.perception.habit import Features
 from sumo_cohesion.social.features import FEATURES, LATERAL
 from sumo_cohesion.social.groups import Vote, Votes
-from sumo_cohesion.social.place import Place
 from sumo_cohesion.social.settings import CohesionSettings
 
 _ZEROS: Features = (0.0,) * len(FEATURES)
@@ -17,8 +16,8 @@ _ZEROS: Features = (0.0,) * len(FEATURES)
 class Agreement(NamedTuple):
     """What one group agrees on, per normalised social feature.
 
-    ``weight`` is 1 / (variance + floor). A group of too few cars has zeros everywhere: it has
-    no say.
+    ``weight`` is 1 / (variance + floor), for features that set the speed times
+    ``speed_weight``. A group of too few cars has zeros everywhere: it has no say.
     """
 
     group: str
@@ -40,7 +39,7 @@ class CohesionTerm(NamedTuple):
 
 
 def agree(votes: Votes, settings: CohesionSettings) -> tuple[Agreement, ...]:
-    """Sample mean, unbiased sample variance and weight of every group's votes."""
+    """Mean, variance and weight of every group's votes."""
     return tuple([_agree(group, cast, settings) for group, cast in votes.items()])
 
 
@@ -49,78 +48,42 @@ def _agree(group: str, votes: Sequence[Vote], settings: CohesionSettings) -> Agr
     if n < settings.min_cars:
         return Agreement(group, n, _ZEROS, _ZEROS, _ZEROS)
     features, habits = zip(*votes, strict=True)
-    values = list(zip(*features, strict=True))
-    if settings.habit > 0.0:
-        columns = [
-            _with_habit(column, habit, settings.variance_floor)
-            for column, habit in zip(values, zip(*habits, strict=True), strict=True)
-        ]
-    else:
-        columns = [_plain(column, settings.variance_floor) for column in values]
-    mean, variance, weight = zip(*columns, strict=True)
+    floor = settings.variance_floor
+    columns = [
+        estimate(values, habit, floor)
+        for values, habit in zip(
+            zip(*features, strict=True), zip(*habits, strict=True), strict=True
+        )
+    ]
+    mean, variance = zip(*columns, strict=True)
     weight = tuple(
         [
-            w if lateral else w * settings.speed_weight
-            for w, lateral in zip(weight, LATERAL, strict=True)
+            (1.0 if lateral else settings.speed_weight) / (v + floor)
+            for v, lateral in zip(variance, LATERAL, strict=True)
         ]
     )
     return Agreement(group, n, mean, variance, weight)
 
 
-def _plain(values: Sequence[float], floor: float) -> tuple[float, float, float]:
-    n = len(values)
-    mean = sum(values) / n
-    variance = sum([(value - mean) * (value - mean) for value in values]) / (n - 1)
-    return mean, variance, 1.0 / (variance + floor)
+def estimate(values: Sequence[float], habits: Sequence[float], floor: float) -> tuple[float, float]:
+    """Mean and variance of what n >= 2 drivers do, each counting by its own reliability.
 
+    With weights q = 1 / (floor + habit): mean = sum q x / sum q, and variance = unbiased
+    weighted sample variance + n / sum q - floor. The last part is what these drivers vary by
+    anyway. Without habits (all zero) this is the paper's plain sample mean and variance.
 
-def _with_habit(
-    values: Sequence[float], habits: Sequence[float], floor: float
-) -> tuple[float, float, float]:
-    """Mean, variance and weight of one feature, each driver counting by its own reliability."""
-    n = len(values)
-    precision = [1.0 / (floor + habit) for habit in habits]
-    total = sum(precision)
-    mean = sum([q * value for q, value in zip(precision, values, strict=True)]) / total
-    spread = sum(
-        [q * (value - mean) * (value - mean) for q, value in zip(precision, values, strict=True)]
-    )
-    variance = spread / total * n / (n - 1) + n / total - floor
-    return mean, variance, 1.0 / (variance + floor)
-
-
-def elect_lateral(
-    groups: Sequence[Agreement], place: Place, threshold: float
-) -> tuple[tuple[Agreement, ...], Place, float]:
-    """Let only the most surprising group vote on lateral features, and none if nothing surprises.
-
-    Once humans have finished a swerve they all drive straight, and their unanimous "straight"
-    elsewhere would outvote the "turn" of those who pass the ego's own place. The ego keeps its
-    lane by itself; so of all agreements the one that contradicts lane keeping most, with the
-    largest sum of weight · mean², is the one that has something to say ("for only the subset
-    of cars that exhibits the low variance", paper, section I). The position group's place
-    counts with it.
+    >>> estimate([0.0, 2.0], [0.0, 0.0], floor=0.01)
+    (1.0, 2.0)
     """
-    surprise = [
-        sum(w * m * m for w, m, lateral in zip(g.weight, g.mean, LATERAL, strict=True) if lateral)
-        + (place.surprise if g.group == "position" else 0.0)
-        for g in groups
-    ]
-    most = max(surprise)
-    chosen = surprise.index(most) if most > threshold else -1
-    elected = tuple(
-        [
-            g
-            if i == chosen
-            else g._replace(
-                weight=tuple([0.0 if lat else w for w, lat in zip(g.weight, LATERAL, strict=True)])
-            )
-            for i, g in enumerate(groups)
-        ]
-    )
-    if chosen < 0 or groups[chosen].group != "position":
-        place = place._replace(weight=(0.0,) * len(place.weight))
-    return elected, place, most
+    total = weighted = squares = 0.0
+    for x, habit in zip(values, habits, strict=True):
+        q = 1.0 / (floor + habit)
+        total += q
+        weighted += q * x
+        squares += q * x * x
+    n, mean = len(values), weighted / total
+    spread = max(squares / total - mean * mean, 0.0)
+    return mean, spread * n / (n - 1) + max(n / total - floor, 0.0)
 
 
 def combine(groups: Sequence[Agreement]) -> CohesionTerm:

@@ -2,8 +2,8 @@
 
 The paper's features are differences, so a car that lags behind a swerve is told to straighten
 when the others straighten, and ends up beside their path. Here the ego also sees where across the
-road the cars of its position group drove, at its own place and at those just ahead, and follows
-that as it follows the other features: by mean and sample variance.
+road those drove who had come along where it came along, at its own place and at those ahead, and
+follows that as it follows the other features: by mean and sample variance.
 """
 
 from __future__ import annotations
@@ -11,8 +11,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from sumo_cohesion.perception.history import History
+from sumo_cohesion.perception.history import History, Track
 from sumo_cohesion.road import Road
+from sumo_cohesion.social.agreement import estimate
 from sumo_cohesion.social.settings import CohesionSettings
 from sumo_cohesion.state import RoadState
 
@@ -20,29 +21,23 @@ SCALE = 3.5
 """Metres by which positions across the road are normalised: a lane's width."""
 
 
-LATERAL_SPEED = 1.0
-"""m/s, at which SUMO's drivers change lane (maxSpeedLat's default): what the ego has time for."""
-
-
 class Place(NamedTuple):
-    """Where the position group wants the ego to be, at each of several times ahead.
+    """Where those who came along here drove, at several times ahead of the ego.
 
-    ``target`` (m) and ``weight`` are per time; a weight of zero asks for nothing. ``n`` cars
-    passed beside the ego's place; ``mean``, ``variance`` (of the position across the road,
-    normalised by SCALE) are those of the place that asks most, and ``surprise`` is how much it
-    contradicts lane keeping: weight · (distance / SCALE)², the distance from the mean to
-    the ego or to the nearest lane centre, whichever is larger.
+    ``mean`` (m), ``variance`` (of the position normalised by SCALE) and ``weight`` are per time;
+    a weight of zero asks for nothing. ``n`` cars came along. ``surprise`` is how much they
+    contradict lane keeping: the largest weight · (distance / SCALE)², the distance from the
+    mean to the ego or to the nearest lane's centre, whichever is larger.
     """
 
     n: int
-    target: tuple[float, ...]
+    mean: tuple[float, ...]
+    variance: tuple[float, ...]
     weight: tuple[float, ...]
-    mean: float
-    variance: float
     surprise: float
 
 
-NOWHERE = Place(0, (), (), 0.0, 0.0, 0.0)
+NOWHERE = Place(0, (), (), (), 0.0)
 """No agreement on a place."""
 
 
@@ -53,79 +48,49 @@ def agree_on_place(
     times: Sequence[float],
     settings: CohesionSettings,
 ) -> Place:
-    """Agreement of the cars that passed beside the ego's place on where they drove from there.
+    """Agreement of the cars that came along where the ego did on where to be from here.
 
     ``times`` (s) are those of the planned stages that are asked.
     """
-    back = ego.s - settings.look_back
-    own = history.ego_path
-    start = max(back, own.first)
-    lane = road.nearest_lane(start, own.at(start))
-    members, habits = [], []
+    companions = _companions(ego, history, settings)
+    if len(companions) < settings.min_cars:
+        return NOWHERE
+    rows, surprise = [], 0.0
+    for time in times:
+        s = ego.s + time * ego.speed
+        found = [
+            (d / SCALE, habit) for track, habit in companions if (d := track.across(s)) is not None
+        ]
+        if len(found) < settings.min_cars:
+            rows.append((ego.d, 0.0, 0.0))
+            continue
+        across, habits = zip(*found, strict=True)
+        mean, variance = estimate(across, habits, settings.variance_floor)
+        mean *= SCALE
+        weight = settings.place_weight / (variance + settings.variance_floor)
+        off = max(abs(mean - ego.d), abs(mean - road.nearest_lane(s, mean)))
+        surprise = max(surprise, weight * (off / SCALE) ** 2)
+        rows.append((mean, variance, weight))
+    means, variances, weights = zip(*rows, strict=True)
+    return Place(len(companions), means, variances, weights, surprise)
+
+
+def _companions(
+    ego: RoadState, history: History, settings: CohesionSettings
+) -> list[tuple[Track, float]]:
+    """Cars that were beside the ego's own path some way back, and have passed it since.
+
+    With the variance of their lateral feature up to there: what they have done since is what they
+    are asked about.
+    """
+    path = history.ego_path
+    back = max(ego.s - settings.place_look_back, path.first)
+    companions = []
     for track in history.all():
         if not track.voter or not track.middle_s or track.middle_s[-1] <= ego.s:
             continue
-        s = max(start, track.middle_s[0])
-        there = track.across(s)
-        if there is not None and abs(there - own.at(s)) <= settings.position_width:
-            members.append(track)
-            habits.append(track.habit_at(s)[0] if settings.habit > 0 else 0.0)
-    if len(members) < settings.min_cars:
-        return NOWHERE
-    horizon = times[-1]
-    preview = [horizon + 0.5 * k for k in range(1, 1 + round(2 * settings.preview))]
-    agreed = []
-    most = (0.0, 0.0, 0.0)
-    for time in (*times, *preview):
-        s = ego.s + time * ego.speed
-        found = [
-            (d, habit)
-            for track, habit in zip(members, habits, strict=True)
-            if (d := track.across(s)) is not None
-        ]
-        if len(found) < settings.min_cars:
-            continue
-        across, habit = zip(*found, strict=True)
-        mean, variance = _mean_and_variance(across)
-        if settings.clip:
-            clipped = [min(max(d, lane - SCALE), lane + SCALE) for d in across]
-            mean_clipped, variance_clipped = _mean_and_variance(clipped)
-            floor = settings.variance_floor * SCALE**2
-            if variance_clipped + floor < 0.5 * (variance + floor):
-                mean, variance = mean_clipped, variance_clipped
-        variance = variance / SCALE**2 + sum(habit) / len(habit)
-        weight = settings.place_weight / (variance + settings.variance_floor)
-        late = LATERAL_SPEED * max(time - horizon, 0.0)
-        distance = max(abs(mean - ego.d), abs(mean - road.nearest_lane(s, mean))) - late
-        if distance > 0.0:
-            surprise = weight * (distance / SCALE) ** 2
-            most = max(most, (surprise, mean, variance))
-        agreed.append((time, mean, weight))
-    targets, weights = zip(*[_must_move(ego.d, time, agreed) for time in times], strict=True)
-    surprise, mean, variance = most
-    return Place(len(members), targets, weights, mean, variance, surprise)
-
-
-def _mean_and_variance(values: Sequence[float]) -> tuple[float, float]:
-    n = len(values)
-    mean = sum(values) / n
-    return mean, sum([(value - mean) * (value - mean) for value in values]) / (n - 1)
-
-
-def _must_move(
-    d: float, time: float, agreed: Sequence[tuple[float, float, float]]
-) -> tuple[float, float]:
-    """Target (m) and weight at one time: the place ahead that the ego is latest for.
-
-    From a place that it reaches in t seconds it may still be LATERAL_SPEED · t away.
-    """
-    most, chosen = 0.0, (d, 0.0)
-    for at, mean, weight in agreed:
-        if at < time - 1e-6:
-            continue
-        away = mean - d
-        late = abs(away) - LATERAL_SPEED * (at - time)
-        if late > 0.0 and weight * late * late > most:
-            most = weight * late * late
-            chosen = (d + (late if away > 0.0 else -late), weight)
-    return chosen
+        s = max(back, track.middle_s[0])
+        d = track.across(s)
+        if d is not None and abs(d - path.at(s)) <= settings.position_width:
+            companions.append((track, track.habit_at(s)[0]))
+    return companions

@@ -6,9 +6,6 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from sumo_cohesion.perception.habit import Habit
-from sumo_cohesion.social.features import LATERAL
-
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
@@ -27,11 +24,13 @@ class CohesionSettings(BaseModel):
         "most_surprising": only the group whose agreement contradicts lane keeping most.
     surprise : lateral agreement counts only if it contradicts lane keeping by more than this
         (largest sum of weight · mean²); what lane keeping does anyway is no news.
-    surprise_hold : seconds for which lateral agreement counts once it has surprised.
-    habit : seconds of a driver's own past whose variance adds to the group's; zero: none.
+    surprise_hold : seconds for which any contradiction counts once there was such a surprise.
     speed_weight : weight of the features that set the speed, relative to those that steer.
+    habit : seconds of a driver's own past whose variance adds to the group's; zero: none.
+    habit_delay : the newest seconds, which do not count as its past yet.
     place_weight : weight of the lateral position at a place (social.place), relative to the
-        other features; zero switches it off.
+        features that steer; zero switches it off.
+    place_look_back : metres back to where the ego and the cars it asks must have come along.
     interval : seconds that a human's transition spans.
     memory : seconds that past transitions are remembered for the position group.
     position_length, position_width : half sizes (m) of the position group's box.
@@ -47,15 +46,11 @@ class CohesionSettings(BaseModel):
     lateral_votes: Literal["all", "most_surprising"] = "most_surprising"
     surprise: NonNegative = 5.0
     surprise_hold: NonNegative = 2.0
+    speed_weight: NonNegative = 0.2
     habit: NonNegative = 10.0
     habit_delay: NonNegative = 2.0
-    habit_prior: NonNegative = 0.3
-    habit_prior_speed: NonNegative = 0.15
-    speed_weight: NonNegative = 0.25
     place_weight: NonNegative = 4.0
-    look_back: NonNegative = 200.0
-    preview: NonNegative = 2.5
-    clip: bool = True
+    place_look_back: NonNegative = 200.0
     interval: Positive = 0.5
     memory: Positive = 20.0
     position_length: Positive = 8.0
@@ -80,15 +75,3 @@ def as_printed(cohesion: CohesionSettings) -> CohesionSettings:
         "position_width": 1.85,
     }
     return cohesion.model_copy(update=printed)
-
-
-def new_habit(cohesion: CohesionSettings) -> Habit:
-    """Return what is known of a driver that has never been seen."""
-    prior = tuple(
-        [
-            cohesion.habit_prior**2 if lateral else cohesion.habit_prior_speed**2
-            for lateral in LATERAL
-        ]
-    )
-    window = max(round(cohesion.habit / cohesion.interval), 1)
-    return Habit(prior, window, delay=round(10 * cohesion.habit_delay), every=5)

@@ -21,7 +21,7 @@ from sumo_cohesion.planning.planners import (
 )
 from sumo_cohesion.planning.settings import PlannerSettings
 from sumo_cohesion.road import Road
-from sumo_cohesion.social.features import social_features
+from sumo_cohesion.social.memory import new_history
 from sumo_cohesion.social.place import NOWHERE
 from sumo_cohesion.social.settings import CohesionSettings
 from sumo_cohesion.state import Observation, RoadState
@@ -46,7 +46,7 @@ def observation(
 
 
 def empty_history() -> History:
-    return History(0.1, 0.5, 20.0, social_features)
+    return new_history(CohesionSettings(), 0.1)
 
 
 def nominal(road: Road, **settings: object) -> Planner:
@@ -176,13 +176,13 @@ def test_a_lagging_ego_is_drawn_to_the_others_path(highway: Road) -> None:
         scene = observation((300.0, 0.4, 0.0, 25.0), cars)
         history.push(scene)
     moved = {}
-    for weight in (0.0, 1.0):
+    for weight in (0.0, 8.0):
         planner = CohesivePlanner(SETTINGS, CohesionSettings(place_weight=weight, surprise=1.0))
         planner.reset(highway)
         plan = planner.plan(scene, history)
         moved[weight] = plan.states[-1, 1] - 0.4
     assert moved[0.0] < 0.0  # back to the lane's centre
-    assert moved[1.0] > 0.1
+    assert moved[8.0] > 0.1
     (row,) = [r for r in plan.agreement if r.feature == "place"]
     assert (row.n, row.mean * 3.5) == pytest.approx((3, 1.6))
 

@@ -8,26 +8,34 @@ import casadi as ca
 import numpy as np
 import pytest
 
+from sumo_cohesion.perception.habit import Habit
 from sumo_cohesion.perception.history import History
 from sumo_cohesion.road import Road
-from sumo_cohesion.social.agreement import Agreement, agree, combine, elect_lateral
+from sumo_cohesion.social.agreement import Agreement, agree, combine, estimate
+from sumo_cohesion.social.election import Election
 from sumo_cohesion.social.features import FEATURES, SCALES, social_features
-from sumo_cohesion.social.groups import group_votes
+from sumo_cohesion.social.groups import Vote, group_votes
+from sumo_cohesion.social.memory import new_history
 from sumo_cohesion.social.place import NOWHERE, agree_on_place
 from sumo_cohesion.social.settings import CohesionSettings
 from sumo_cohesion.state import Observation, RoadState
 
-SETTINGS = CohesionSettings(place_weight=1.0)
+SETTINGS = CohesionSettings(habit=0.0, speed_weight=1.0, place_weight=1.0)
+"""The paper's plain mean and variance."""
+UNKNOWN = (0.0,) * 5
 
 
 def observe(
-    time: float, cars: dict[str, tuple[float, float, float]], special: str = ""
+    time: float,
+    cars: dict[str, tuple[float, float, float]],
+    special: str = "",
+    ego: tuple[float, float] = (0.0, 0.0),
 ) -> Observation:
-    """Cars by name: s, d, speed."""
+    """Cars by name: s, d, speed; the ego: s, d."""
     states = np.array([[s, d, 0.0, v] for s, d, v in cars.values()]).reshape(-1, 4)
     return Observation(
         time=time,
-        ego=RoadState(0.0, 0.0, 0.0, 25.0),
+        ego=RoadState(*ego, 0.0, 25.0),
         ego_size=(5.0, 1.8),
         ids=tuple(cars),
         states=states,
@@ -38,7 +46,7 @@ def observe(
 
 
 def history(memory: float = 20.0) -> History:
-    return History(0.1, 0.5, memory, social_features)
+    return new_history(SETTINGS.model_copy(update={"memory": memory}), 0.1)
 
 
 def drive(h: History, steps: int, cars: dict[str, tuple[float, float, float, float]]) -> None:
@@ -169,7 +177,8 @@ def test_special_and_oncoming_vehicles_do_not_vote(highway: Road) -> None:
 def test_agreement_is_mean_and_unbiased_variance() -> None:
     rng = np.random.default_rng(3)
     rows = [tuple(row) for row in rng.normal(size=(6, 5)).tolist()]
-    group, lonely = agree({"road": rows, "lane": rows[:1]}, SETTINGS)
+    votes = [Vote(row, UNKNOWN) for row in rows]
+    group, lonely = agree({"road": votes, "lane": votes[:1]}, SETTINGS)
     assert group.mean == pytest.approx(np.mean(rows, axis=0))
     assert group.variance == pytest.approx(np.var(rows, axis=0, ddof=1))
     assert group.weight == pytest.approx(1 / (np.var(rows, axis=0, ddof=1) + 2.5e-3))
@@ -177,43 +186,124 @@ def test_agreement_is_mean_and_unbiased_variance() -> None:
 
 
 def test_perfect_agreement_has_the_floors_weight() -> None:
-    (group,) = agree({"road": [(0.1, 2.0, 0.0, 2.0, 0.3)] * 3}, SETTINGS)
+    (group,) = agree({"road": [Vote((0.1, 2.0, 0.0, 2.0, 0.3), UNKNOWN)] * 3}, SETTINGS)
     assert group.variance == pytest.approx([0.0] * 5, abs=1e-12)
     assert group.weight == pytest.approx([400.0] * 5)
 
 
+def test_a_driver_counts_by_its_habits_and_the_group_is_no_surer_than_its_members() -> None:
+    # q = 1 / (floor + habit) = 10 and 2: mean 2/12, spread (10/36 + 50/36) / 12 · 2, n/Q 1/6.
+    mean, variance = estimate([0.0, 1.0], [0.09, 0.49], floor=0.01)
+    assert mean == pytest.approx(1 / 6)
+    assert variance == pytest.approx(60 / 36 / 12 * 2 + 2 / 12 - 0.01)
+    # However well they agree, drivers with a habit of 0.09 weigh 1 / (0.09 + floor) at most.
+    votes = [Vote((0.5,) * 5, (0.09,) * 5)] * 3
+    (group,) = agree({"road": votes}, SETTINGS)
+    assert group.weight == pytest.approx([1 / 0.0925] * 5)
+
+
+def test_speed_features_weigh_less_by_their_setting() -> None:
+    settings = SETTINGS.model_copy(update={"speed_weight": 0.25})
+    (group,) = agree({"road": [Vote((0.1,) * 5, UNKNOWN)] * 2}, settings)
+    assert group.weight == pytest.approx([400.0, 100.0, 400.0, 100.0, 400.0])
+
+
+def test_habits_are_the_variance_of_a_drivers_older_past() -> None:
+    rng = np.random.default_rng(7)
+    values = rng.normal(scale=0.5, size=200)
+    habit = Habit((0.09,), window=1000, delay=4)
+    for i, value in enumerate(values):
+        assert habit.variance == (0.09,) or i > 4  # the newest four do not count yet
+        habit.see((float(value),))
+    old = values[:-4]
+    # The prior counts as one value beside the sample's own.
+    expected = (0.09 + len(old) * old.var()) / (len(old) + 1)
+    assert habit.variance[0] == pytest.approx(expected, rel=0.05)
+    # A driver who stops weaving is trusted again, after the window.
+    habit = Habit((0.09,), window=20, delay=4)
+    for value in [*values, *[0.0] * 100]:
+        habit.see((float(value),))
+    assert habit.variance[0] < 0.05 * old.var()
+
+
+def test_without_habits_nobody_has_any() -> None:
+    h = history()
+    drive(h, 100, {"a": (0.0, 0.0, 25.0, 1.0)})
+    (track,) = h.in_sight()
+    assert track.habits[-1] == UNKNOWN
+    known = new_history(CohesionSettings(), 0.1)
+    drive(known, 100, {"a": (0.0, 0.0, 25.0, 0.0)})
+    (track,) = known.in_sight()
+    assert track.habits[0] == pytest.approx((0.09, 0.0225, 0.09, 0.0225, 0.09))
+    assert max(track.habits[-1]) < 0.02
+
+
+TURN = Agreement("position", 3, (1.0, 2.5, 0.5, 2.5, 1.0), (0.0,) * 5, (400.0,) * 5)
+STRAIGHT = Agreement("road", 4, (0.0, 2.5, 0.0, 2.5, 0.0), (0.0,) * 5, (400.0,) * 5)
+SPEED_ONLY = (0.0, 400.0, 0.0, 400.0, 0.0)
+
+
 def test_only_the_most_surprising_group_steers_but_all_set_the_speed() -> None:
-    turn = Agreement("position", 3, (1.0, 2.5, 0.5, 2.5, 1.0), (0.0,) * 5, (400.0,) * 5)
-    straight = Agreement("road", 4, (0.0, 2.5, 0.0, 2.5, 0.0), (0.0,) * 5, (400.0,) * 5)
-    speed_only = (0.0, 400.0, 0.0, 400.0, 0.0)
-    elected, _ = elect_lateral((turn, straight), NOWHERE, threshold=1.0)
-    assert [g.weight for g in elected] == [turn.weight, speed_only]
+    elected, _ = Election(SETTINGS).elect((TURN, STRAIGHT), NOWHERE, 0.0)
+    assert [g.weight for g in elected] == [TURN.weight, SPEED_ONLY]
     # Driving straight is what lane keeping does anyway: it must not freeze an ego in between.
-    elected, _ = elect_lateral((straight, straight), NOWHERE, threshold=1.0)
-    assert [g.weight for g in elected] == [speed_only, speed_only]
+    elected, _ = Election(SETTINGS).elect((STRAIGHT, STRAIGHT), NOWHERE, 0.0)
+    assert [g.weight for g in elected] == [SPEED_ONLY, SPEED_ONLY]
+
+
+def test_a_surprise_keeps_attention_for_a_while() -> None:
+    slight = TURN._replace(weight=(1.5, 400.0, 0.0, 400.0, 0.5))  # surprise 2: below 5, above 1
+    election = Election(SETTINGS)
+
+    def steers(group: Agreement, time: float) -> bool:
+        (elected,), _ = election.elect((group,), NOWHERE, time)
+        return elected.weight == group.weight
+
+    assert not steers(slight, 0.0)
+    assert steers(TURN, 0.1)
+    assert steers(slight, 2.0)
+    assert not steers(slight, 2.2)
+    assert steers(TURN, 3.0)
+    election.reset()
+    assert not steers(slight, 3.1)
+
+
+def come_along(
+    d: float, cars: dict[str, tuple[float, float, float, float]], steps: int = 60
+) -> History:
+    """Drive an ego at 25 m/s from s = 150 at d among cars: s, d, speed along, speed across."""
+    h = history()
+    for k in range(steps):
+        t = 0.1 * k
+        seen = {n: (s + v * t, c + w * t, hypot(v, w)) for n, (s, c, v, w) in cars.items()}
+        h.push(observe(t, seen, ego=(150.0 + 25.0 * t, d)))
+    return h
 
 
 def test_a_place_off_the_lane_centre_is_news_and_one_on_it_is_not(highway: Road) -> None:
     for d, expected in ((1.6, 400.0 * (1.6 / 3.5) ** 2), (0.0, 0.0)):
-        h = history()
-        drive(h, 60, {c: (s, d, 25.0, 0.0) for c, s in (("a", 270.0), ("b", 250.0))})
-        ego = RoadState(300.0, d, 0.0, 25.0)
-        place = agree_on_place(ego, h, highway, [302.5, 310.0, 900.0], SETTINGS)
+        h = come_along(1.0, {c: (s, d, 25.0, 0.0) for c, s in (("a", 270.0), ("b", 250.0))})
+        ego = RoadState(297.5, d, 0.0, 25.0)
+        place = agree_on_place(ego, h, highway, [0.1, 0.5, 1.0], SETTINGS)
         assert place.n == 2
-        assert place.mean[:2] == pytest.approx((d, d))
-        assert place.weight == pytest.approx((400.0, 400.0, 0.0))
         assert place.surprise == pytest.approx(expected)
         straight = Agreement("position", 2, (0.0, 2.5, 0.0, 2.5, 0.0), (0.0,) * 5, (400.0,) * 5)
-        (group,), elected = elect_lateral((straight,), place, threshold=1.0)
+        (group,), elected = Election(SETTINGS).elect((straight,), place, 0.0)
         assert (group.weight == straight.weight) is (d > 0)
-        assert (elected == place) is (d > 0)
+        assert elected.weight == (place.weight if d > 0 else (0.0,) * 3)
 
 
-def test_cars_that_passed_far_aside_do_not_vote_on_the_place(highway: Road) -> None:
-    h = history()
-    drive(h, 60, {c: (s, 7.0, 25.0, 0.0) for c, s in (("a", 270.0), ("b", 250.0))})
-    place = agree_on_place(RoadState(300.0, 0.0, 0.0, 25.0), h, highway, [302.5], SETTINGS)
-    assert (place.n, place.weight, place.surprise) == (0, (0.0,), 0.0)
+def test_a_lagging_ego_is_told_where_the_others_were(highway: Road) -> None:
+    h = come_along(0.0, {c: (s, 1.6, 25.0, 0.0) for c, s in (("a", 270.0), ("b", 250.0))})
+    place = agree_on_place(RoadState(297.5, 0.2, 0.0, 25.0), h, highway, [0.1, 0.5], SETTINGS)
+    assert place.mean == pytest.approx((1.6, 1.6))
+    assert place.weight == pytest.approx((400.0, 400.0))
+
+
+def test_who_did_not_come_along_has_no_say_on_the_place(highway: Road) -> None:
+    h = come_along(0.0, {c: (s, 7.0, 25.0, 0.0) for c, s in (("a", 270.0), ("b", 250.0))})
+    place = agree_on_place(RoadState(297.5, 0.0, 0.0, 25.0), h, highway, [0.1], SETTINGS)
+    assert place == NOWHERE
 
 
 def test_combined_term_differs_from_the_groups_sum_by_a_constant() -> None:

@@ -1,0 +1,325 @@
+"""The paper's claims, measured: every scenario, every planner, paired seeds.
+
+    python analysis/reproduce.py [--seeds 0:50] [--workers 2] [--cases stalled,exit]
+
+Writes into analysis/: claims.csv (each claim's rate with its 95 % Wilson interval), outcomes.csv
+(what happened per case and planner), runs.parquet (all metrics of all runs) and reproduce.json
+(command, seeds, versions). Finished parts are kept in results/reproduce; run it again after a stop
+and it goes on from there. What was measured with other code or scenarios is not taken up.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+import sumo_cohesion
+from sumo_cohesion import compare
+from sumo_cohesion.cli import parse_seeds
+from sumo_cohesion.errors import SimulationError, UserError
+from sumo_cohesion.experiments.rollout import versions
+from sumo_cohesion.experiments.scenario import bundled
+from sumo_cohesion.experiments.statistics import wilson
+
+HERE = Path(__file__).resolve().parent
+PLANNERS = ("nominal", "cohesive", "paper", "sumo")
+OURS = PLANNERS[:3]
+PART = 10
+"""Seeds that are run and kept together."""
+
+Case = tuple[str, Mapping[str, Any]]
+CASES: dict[str, Case] = {
+    "stalled": ("stalled", {}),
+    "stalled_swerve": ("stalled_swerve", {}),
+    "ambulance": ("ambulance", {}),
+    "ambulance_rescue_lane": ("ambulance_rescue_lane", {}),
+    "speeding": ("speeding", {}),
+    "exit": ("exit", {}),
+    "nothing_to_follow": ("nothing_to_follow", {}),
+    "nothing_to_follow, 7 humans": ("nothing_to_follow", {"randomize.humans": [7, 7]}),
+    "same_speed": ("same_speed", {}),
+    "stalled_noise, 0.1": ("stalled_noise", {"human_type.lcSigma": 0.1}),
+    "stalled_noise, 0.3": ("stalled_noise", {"human_type.lcSigma": 0.3}),
+    "stalled_noise, 0.6": ("stalled_noise", {"human_type.lcSigma": 0.6}),
+    "stalled_noise, 1.0": ("stalled_noise", {"human_type.lcSigma": 1.0}),
+    "stalled, leads 40 m apart": ("stalled", {"randomize.lead_spacing": [40.0, 40.0]}),
+    "stalled_dense": ("stalled_dense", {}),
+    "stalled_dense, 7 to 11 humans": ("stalled_dense", {"randomize.humans": [7, 11]}),
+}
+
+
+@dataclass(frozen=True)
+class Claim:
+    """One statement about runs, counted for every planner.
+
+    ``targets`` say, by planner, the least or the largest rate that the claim needs.
+    """
+
+    text: str
+    cases: Sequence[str]
+    holds: Callable[[pd.DataFrame], pd.Series]
+    targets: Mapping[str, str]
+
+
+def _success(runs: pd.DataFrame) -> pd.Series:
+    return runs["success"]
+
+
+NOTHING = [case for case in CASES if case.startswith("nothing_to_follow")]
+NOISE = [case for case in CASES if case.startswith("stalled_noise")]
+CLAIMS = (
+    Claim(
+        "collides with the stalled car",
+        [case for case in CASES if case.startswith("stalled")],
+        lambda r: r["collision"] & ~r["collision_visible"],
+        {"nominal": ">= 0.95", "cohesive": "<= 0.03"},
+    ),
+    Claim(
+        "holds the ambulance up by 2.5 s or more",
+        ["ambulance"],
+        lambda r: r["emergency_delay"] >= 2.5,
+        {"nominal": ">= 0.95"},
+    ),
+    Claim(
+        "out of the ambulance's lane within 8 s, which loses less than 0.5 s",
+        ["ambulance"],
+        lambda r: (r["yield_time"] <= 8.0) & (r["emergency_delay"] < 0.5),
+        {"cohesive": ">= 0.95"},
+    ),
+    Claim(
+        "stays within 0.3 m of where it was",
+        ["ambulance_rescue_lane"],
+        lambda r: r["max_lateral_shift"] <= 0.3,
+        {"nominal": ">= 0.95"},
+    ),
+    Claim(
+        "moves aside with its lane's humans",
+        ["ambulance_rescue_lane"],
+        _success,
+        {"cohesive": ">= 0.90"},
+    ),
+    Claim(
+        "holds the limit within 0.5 m/s",
+        ["speeding"],
+        lambda r: r["max_speed_shift"] <= 0.5,
+        {"nominal": ">= 0.95"},
+    ),
+    Claim(
+        "closes 50 to 100 % of the speed gap, never above the others",
+        ["speeding"],
+        _success,
+        {"cohesive": ">= 0.95"},
+    ),
+    Claim(
+        "takes the wrong exit",
+        ["exit"],
+        lambda r: r["exited"],
+        {"nominal": "<= 0.00", "cohesive": ">= 0.90"},
+    ),
+    Claim(
+        "within 1 m and 1.5 m/s of its nominal twin",
+        NOTHING,
+        _success,
+        {"cohesive": ">= 0.90"},
+    ),
+    Claim(
+        "within 1 m and 1.5 m/s of nominal's own run",
+        NOTHING,
+        lambda r: (r["nominal_lateral_deviation"] <= 1.0) & (r["nominal_speed_deviation"] <= 1.5),
+        {},
+    ),
+    Claim(
+        "matches the speed, within 1.2 m sideways, and agrees most on the speed's features",
+        ["same_speed"],
+        _success,
+        {"cohesive": ">= 0.95"},
+    ),
+    Claim(
+        "touches a car that it can see",
+        list(CASES),
+        lambda r: r["collision_visible"],
+        dict.fromkeys(OURS, "<= 0.00"),
+    ),
+)
+
+
+def measure(case: str, runs: pd.DataFrame) -> list[dict[str, object]]:
+    """Count every claim about a case, per planner."""
+    rows: list[dict[str, object]] = []
+    for claim in CLAIMS:
+        if case not in claim.cases:
+            continue
+        for planner, own in runs.groupby("planner", sort=False):
+            count, n = int(claim.holds(own).sum()), len(own)
+            rate, low, high = wilson(count, n)
+            target = claim.targets.get(str(planner), "")
+            rows.append(
+                {
+                    "case": case,
+                    "claim": claim.text,
+                    "planner": planner,
+                    "count": count,
+                    "n": n,
+                    "rate": round(rate, 3),
+                    "low": round(low, 3),
+                    "high": round(high, 3),
+                    "target": target,
+                    "met": _met(rate, target),
+                    "seeds_against": _seeds_against(own, claim, target),
+                }
+            )
+    return rows
+
+
+def _met(rate: float, target: str) -> str:
+    if not target:
+        return ""
+    side, bound = target.split()
+    return str(rate >= float(bound) if side == ">=" else rate <= float(bound))
+
+
+def _seeds_against(runs: pd.DataFrame, claim: Claim, target: str) -> str:
+    """Seeds that speak against a claim with a target: the ones to look into."""
+    if not target:
+        return ""
+    holds = claim.holds(runs)
+    against = ~holds if target.startswith(">=") else holds
+    return " ".join(map(str, runs.loc[against, "seed"]))
+
+
+def outcomes(case: str, runs: pd.DataFrame) -> list[dict[str, object]]:
+    """Count what happened in a case, per planner, with medians of the metrics that matter."""
+    medians = (
+        "distance",
+        "max_lateral_shift",
+        "speed_gap_closed",
+        "max_excess_speed",
+        "speed_most_agreed",
+        "plan_lateral_change",
+        "plan_speed_change",
+        "twin_lateral_deviation",
+        "twin_speed_deviation",
+        "nominal_lateral_deviation",
+        "nominal_speed_deviation",
+        "emergency_delay",
+        "yield_time",
+        "aside_share",
+        "passing_lane",
+        "max_lateral_acceleration",
+        "plan_ms_median",
+    )
+    rows: list[dict[str, object]] = []
+    for planner, own in runs.groupby("planner", sort=False):
+        counted = ("success", "collision", "collision_visible", "off_road", "exited")
+        row: dict[str, object] = {"case": case, "planner": planner, "n": len(own)}
+        row |= {name: int(own[name].sum()) for name in counted}
+        row["seen_by_sumo"] = int((own["collision"] & own["sumo_collision"]).sum())
+        row["fallback_steps"] = int(own["plan_failures"].sum())
+        row |= {f"median_{name}": round(float(own[name].median()), 3) for name in medians}
+        rows.append(row)
+    return rows
+
+
+def fingerprint() -> str:
+    """Digest of what decides results: the package's rooms and the bundled data."""
+    package = Path(sumo_cohesion.__file__).parent
+    files = [p for p in package.rglob("*.py") if p.parent.name != "report" and p.stem != "cli"]
+    for kind in ("scenarios", "networks", "routes"):
+        files += [p for p in bundled(kind).iterdir() if p.is_file()]
+    digest = hashlib.sha1(usedforsecurity=False)
+    for path in sorted(files, key=lambda p: p.name):
+        digest.update(path.name.encode() + b"\0" + path.read_bytes())
+    digest.update(json.dumps(versions(), sort_keys=True).encode())
+    return digest.hexdigest()[:12]
+
+
+def parts(seeds: Sequence[int]) -> list[Sequence[int]]:
+    """Cut the seeds into parts that are kept one by one."""
+    return [seeds[i : i + PART] for i in range(0, len(seeds), PART)]
+
+
+def run_cases(
+    cases: Sequence[str], seeds: Sequence[int], workers: int | None, work: Path
+) -> dict[str, pd.DataFrame]:
+    """Run what has not been run yet; say how far it is and how long it will take."""
+    jobs = [(case, part) for case in cases for part in parts(seeds)]
+    paths = {
+        (case, part[0]): work
+        / f"{case.replace(', ', '-').replace(' ', '_')}-{part[0]}-{part[-1]}.parquet"
+        for case, part in jobs
+    }
+    todo = [(case, part) for case, part in jobs if not paths[case, part[0]].is_file()]
+    work.mkdir(parents=True, exist_ok=True)
+    if len(todo) < len(jobs):
+        print(f"{len(jobs) - len(todo)} of {len(jobs)} parts are there already", file=sys.stderr)
+    start = time.monotonic()
+    for done, (case, part) in enumerate(todo):
+        left = f", about {_minutes(start, done, len(todo))} left" if done else ""
+        print(f"[{done + 1}/{len(todo)}] {case}, {len(part)} seeds{left}", file=sys.stderr)
+        scenario, overrides = CASES[case]
+        runs = compare(scenario, PLANNERS, part, overrides=overrides, workers=workers).runs
+        path = paths[case, part[0]]
+        runs.to_parquet(path.with_suffix(".new"), index=False)
+        path.with_suffix(".new").replace(path)
+    return {
+        case: pd.concat(
+            [pd.read_parquet(paths[case, part[0]]) for part in parts(seeds)], ignore_index=True
+        )
+        for case in cases
+    }
+
+
+def _minutes(start: float, done: int, todo: int) -> str:
+    seconds = (time.monotonic() - start) / done * (todo - done)
+    return f"{seconds / 60:.0f} min"
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--seeds", default="0:50")
+    parser.add_argument("--cases", default=",".join(CASES).replace(", ", "; "))
+    parser.add_argument("--workers", type=int, default=None)
+    parser.add_argument("--out", type=Path, default=HERE)
+    parser.add_argument("--work", type=Path, default=HERE.parent / "results" / "reproduce")
+    given = parser.parse_args(arguments)
+    cases = [case.replace("; ", ", ") for case in given.cases.split(",")]
+    unknown = [case for case in cases if case not in CASES]
+    if unknown:
+        sys.exit(f"no case {unknown[0]!r}; choose from: {'; '.join(CASES)}")
+    try:
+        seeds = parse_seeds(given.seeds)
+        runs = run_cases(cases, seeds, given.workers, given.work / fingerprint())
+    except KeyboardInterrupt:
+        sys.exit("interrupted; what is done is kept, run it again to go on")
+    except (UserError, SimulationError) as error:
+        sys.exit(f"{error}; what is done is kept, run it again to go on")
+    given.out.mkdir(parents=True, exist_ok=True)
+    claims = pd.DataFrame([row for case in cases for row in measure(case, runs[case])])
+    claims.to_csv(given.out / "claims.csv", index=False)
+    table = pd.DataFrame([row for case in cases for row in outcomes(case, runs[case])])
+    table.to_csv(given.out / "outcomes.csv", index=False)
+    everything = pd.concat([own.assign(case=case) for case, own in runs.items()])
+    everything.to_parquet(given.out / "runs.parquet", index=False)
+    about = {
+        "command": f"python analysis/reproduce.py --seeds {given.seeds}",
+        "seeds": given.seeds,
+        "cases": {case: {"scenario": CASES[case][0], **CASES[case][1]} for case in cases},
+        "fitted_on": "seeds >= 1000",
+        "versions": versions(),
+    }
+    (given.out / "reproduce.json").write_text(json.dumps(about, indent=2) + "\n", encoding="utf-8")
+    wanted = claims[claims["target"] != ""]
+    print(wanted.drop(columns=["seeds_against", "low", "high"]).to_string(index=False))
+
+
+if __name__ == "__main__":
+    main()
