@@ -5,7 +5,7 @@ NETCONVERT := $(BIN)/netconvert --offset.disable-normalization true --no-turnaro
 # Threads of the linear algebra library only cost time here: the matrices are tiny.
 export OPENBLAS_NUM_THREADS := 1
 
-.PHONY: demo test lint check format networks docs lock wheel benchmark reproduce figures clean
+.PHONY: demo test lint check format networks docs lock wheel benchmark reproduce ablation figures clean
 
 demo: $(VENV)/.installed
 	$(BIN)/sumo-cohesion compare stalled --seeds 0:8 --out demo
@@ -44,10 +44,14 @@ lock: $(VENV)/.installed
 	$(BIN)/uv pip compile pyproject.toml --all-extras --universal --no-annotate --no-header \
 	  --no-emit-index-url --no-emit-find-links --python-version 3.11 -o requirements.lock
 
-# Everything in analysis/ and docs/figures: about an hour on two cores. After a stop it goes on.
+# The claims and the figures: about an hour on two cores. After a stop it goes on.
 reproduce: $(VENV)/.installed
 	$(BIN)/python analysis/reproduce.py
 	$(BIN)/python analysis/figures.py
+
+# What each addition to the printed formula is worth: about a quarter of an hour.
+ablation: $(VENV)/.installed
+	$(BIN)/python analysis/ablation.py
 
 figures: $(VENV)/.installed
 	$(BIN)/python analysis/figures.py

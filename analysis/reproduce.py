@@ -248,34 +248,41 @@ def parts(seeds: Sequence[int]) -> list[Sequence[int]]:
 
 
 def run_cases(
-    cases: Sequence[str], seeds: Sequence[int], workers: int | None, work: Path
+    cases: Mapping[str, Case],
+    planners: Sequence[str],
+    seeds: Sequence[int],
+    workers: int | None,
+    work: Path,
 ) -> dict[str, pd.DataFrame]:
     """Run what has not been run yet; say how far it is and how long it will take."""
-    jobs = [(case, part) for case in cases for part in parts(seeds)]
-    paths = {
-        (case, part[0]): work
-        / f"{case.replace(', ', '-').replace(' ', '_')}-{part[0]}-{part[-1]}.parquet"
-        for case, part in jobs
+    folder = work / fingerprint()
+    folder.mkdir(parents=True, exist_ok=True)
+    jobs = {
+        (case, i): folder / f"{_file_name(case)}-{part[0]}-{part[-1]}.parquet"
+        for case in cases
+        for i, part in enumerate(parts(seeds))
     }
-    todo = [(case, part) for case, part in jobs if not paths[case, part[0]].is_file()]
-    work.mkdir(parents=True, exist_ok=True)
+    todo = [job for job, path in jobs.items() if not path.is_file()]
     if len(todo) < len(jobs):
         print(f"{len(jobs) - len(todo)} of {len(jobs)} parts are there already", file=sys.stderr)
     start = time.monotonic()
-    for done, (case, part) in enumerate(todo):
+    for done, (case, i) in enumerate(todo):
+        part = parts(seeds)[i]
         left = f", about {_minutes(start, done, len(todo))} left" if done else ""
         print(f"[{done + 1}/{len(todo)}] {case}, {len(part)} seeds{left}", file=sys.stderr)
-        scenario, overrides = CASES[case]
-        runs = compare(scenario, PLANNERS, part, overrides=overrides, workers=workers).runs
-        path = paths[case, part[0]]
+        scenario, overrides = cases[case]
+        runs = compare(scenario, planners, part, overrides=overrides, workers=workers).runs
+        path = jobs[case, i]
         runs.to_parquet(path.with_suffix(".new"), index=False)
         path.with_suffix(".new").replace(path)
-    return {
-        case: pd.concat(
-            [pd.read_parquet(paths[case, part[0]]) for part in parts(seeds)], ignore_index=True
-        )
-        for case in cases
+    tables = {
+        case: [pd.read_parquet(p) for (c, _), p in jobs.items() if c == case] for case in cases
     }
+    return {case: pd.concat(own, ignore_index=True) for case, own in tables.items()}
+
+
+def _file_name(case: str) -> str:
+    return case.replace(", ", "-").replace(" ", "_")
 
 
 def _minutes(start: float, done: int, todo: int) -> str:
@@ -297,7 +304,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         sys.exit(f"no case {unknown[0]!r}; choose from: {'; '.join(CASES)}")
     try:
         seeds = parse_seeds(given.seeds)
-        runs = run_cases(cases, seeds, given.workers, given.work / fingerprint())
+        chosen = {case: CASES[case] for case in cases}
+        runs = run_cases(chosen, PLANNERS, seeds, given.workers, given.work)
     except KeyboardInterrupt:
         sys.exit("interrupted; what is done is kept, run it again to go on")
     except (UserError, SimulationError) as error:

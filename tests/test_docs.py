@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from analysis import markdown
 from sumo_cohesion import cli
 from sumo_cohesion.experiments.columns import describe_tables
 from sumo_cohesion.experiments.scenario import Scenario
@@ -76,3 +77,8 @@ def test_scenario_page_shows_every_key_and_a_valid_file() -> None:
     bundled = tomllib.loads((ROOT / "scenarios" / "stalled.toml").read_text())
     shared = {k: v for k, v in data.items() if k in bundled and not isinstance(v, dict)}
     assert shared == {k: bundled[k] for k in shared}
+
+
+def test_the_evidence_holds_the_tables_that_were_measured() -> None:
+    text = markdown.EVIDENCE.read_text(encoding="utf-8")
+    assert markdown.with_tables(text) == text

@@ -77,3 +77,13 @@ def test_noise_disperses_the_humans_and_cohesive_still_follows_them() -> None:
     noisy = run("stalled_noise", "cohesive", 1000)
     assert noisy.metrics["success"].iloc[0]
     assert noisy.info["scenario"]["human_type"] == {"lcSigma": 0.3}
+
+
+def test_nothing_to_follow_is_not_followed() -> None:
+    cohesive = run("nothing_to_follow", "cohesive", 1000).metrics.iloc[0]
+    assert cohesive["success"]
+    # It is the drivers' habits that tell: a car that does not know them follows a chance pair.
+    naive = {"cohesion.habit": 0.0, "cohesion.speed_weight": 1.0}
+    gullible = run("nothing_to_follow", "cohesive", 1000, overrides=naive).metrics.iloc[0]
+    assert not gullible["success"]
+    assert gullible["twin_speed_deviation"] > cohesive["twin_speed_deviation"] + 0.5
