@@ -47,11 +47,13 @@ lock: $(VENV)/.installed
 # The claims and the figures: about an hour on two cores. After a stop it goes on.
 reproduce: $(VENV)/.installed
 	$(BIN)/python analysis/reproduce.py
+	$(BIN)/python -m analysis.markdown
 	$(BIN)/python analysis/figures.py
 
 # What each addition to the printed formula is worth: about a quarter of an hour.
 ablation: $(VENV)/.installed
-	$(BIN)/python analysis/ablation.py
+	$(BIN)/python -m analysis.ablation
+	$(BIN)/python -m analysis.markdown
 
 figures: $(VENV)/.installed
 	$(BIN)/python analysis/figures.py

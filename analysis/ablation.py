@@ -1,6 +1,6 @@
 """What each addition to the printed formula is worth: the default with one piece taken out.
 
-    python analysis/ablation.py [--seeds 2000:2020] [--workers 2]
+    python -m analysis.ablation [--seeds 2000:2020] [--workers 2]
 
 Writes analysis/ablation.csv and analysis/ablation.json. The seeds are neither those the pieces
 were chosen on (1000 to 1999) nor those the claims are reported on.
@@ -16,9 +16,10 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
-from reproduce import HERE, Case, run_cases
 
+from analysis.reproduce import HERE, Case, run_cases
 from sumo_cohesion.cli import parse_seeds
+from sumo_cohesion.errors import SimulationError, UserError
 from sumo_cohesion.experiments.rollout import versions
 
 PIECES: dict[str, Mapping[str, Any]] = {
@@ -51,13 +52,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
         results = run_cases(cases, ("cohesive",), seeds, given.workers, given.work)
     except KeyboardInterrupt:
         sys.exit("interrupted; what is done is kept, run it again to go on")
+    except (UserError, SimulationError) as error:
+        sys.exit(f"{error}; what is done is kept, run it again to go on")
     rows = []
     for case, runs in results.items():
         scenario, piece = case.split(SEPARATOR, 1)
         rows.append(
             {
                 "scenario": scenario,
-                "without": piece,
+                "changed": piece,
                 "n": len(runs),
                 "success": int(runs["success"].sum()),
                 "collision": int(runs["collision"].sum()),
@@ -72,12 +75,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     given.out.mkdir(parents=True, exist_ok=True)
     table.to_csv(given.out / "ablation.csv", index=False)
     about = {
-        "command": f"python analysis/ablation.py --seeds {given.seeds}",
+        "command": f"python -m analysis.ablation --seeds {given.seeds}",
         "pieces": PIECES,
         "versions": versions(),
     }
     (given.out / "ablation.json").write_text(json.dumps(about, indent=2) + "\n", encoding="utf-8")
-    print(table.pivot(index="without", columns="scenario", values="success").to_string())
+    print(table.pivot(index="changed", columns="scenario", values="success").to_string())
 
 
 if __name__ == "__main__":

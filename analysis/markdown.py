@@ -1,6 +1,6 @@
 """The tables of docs/evidence.md, made of analysis/*.csv.
 
-    python analysis/markdown.py
+    python -m analysis.markdown
 
 Each table stands between two comments that name it; a test holds that they are up to date.
 """
@@ -42,10 +42,10 @@ def ablation_table(ablation: pd.DataFrame) -> str:
     """One row per piece taken out, one column per scenario: successes."""
     scenarios = list(dict.fromkeys(ablation["scenario"]))
     lines = [
-        "| taken out | " + " | ".join(f"`{s}`" for s in scenarios) + " |",
+        "| changed | " + " | ".join(f"`{s}`" for s in scenarios) + " |",
         "|---|" + "---|" * len(scenarios),
     ]
-    for piece, rows in ablation.groupby("without", sort=False):
+    for piece, rows in ablation.groupby("changed", sort=False):
         by_scenario = rows.set_index("scenario")["success"]
         cells = [str(by_scenario[s]) for s in scenarios]
         lines.append(f"| {piece} | " + " | ".join(cells) + " |")

@@ -116,8 +116,9 @@ class AgreementRow(NamedTuple):
     """One social feature of one group: what its cars agree on, and how strongly it pulled.
 
     ``mean`` and ``variance`` are of the normalised feature; ``weight`` is 1/variance with the
-    floor applied, zero where the group has no vote; ``own`` is the ego's value if it keeps its
-    course; ``pull`` is what ignoring the group would cost: beta · weight · (mean − own)².
+    floor and the settings' relative weights applied, zero where the group has no vote; ``own`` is
+    the ego's value if it keeps its course; ``pull`` is what ignoring the group would cost in
+    one step: beta · weight · (mean − own)².
     """
 
     group: str

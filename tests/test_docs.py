@@ -81,4 +81,4 @@ def test_scenario_page_shows_every_key_and_a_valid_file() -> None:
 
 def test_the_evidence_holds_the_tables_that_were_measured() -> None:
     text = markdown.EVIDENCE.read_text(encoding="utf-8")
-    assert markdown.with_tables(text) == text
+    assert markdown.with_tables(text) == text, "run: python -m analysis.markdown"

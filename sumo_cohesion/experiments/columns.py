@@ -57,9 +57,9 @@ PLAN = (
 AGREEMENT = (
     Column("time", "float64", "s", "SUMO time"),
     Column("group", "string", "", "position, lane or road"),
-    Column("feature", "string", "", "social feature"),
+    Column("feature", "string", "", "social feature; 'place' is where across the road, in lanes"),
     Column("n", "int64", "", "cars that voted"),
-    Column("mean", "float64", "", "sample mean of the normalised feature"),
+    Column("mean", "float64", "", "of the normalised feature, each car by its reliability"),
     Column("variance", "float64", "", "of what the cars do, their habits included"),
     Column("precision", "float64", "", "1 / (variance + floor); NaN: too few cars to agree"),
     Column("weight", "float64", "", "precision as it counts; 0: the group has no vote on it"),
@@ -108,7 +108,12 @@ METRICS = (
     Column("distance", "float64", "m", "driven along the route"),
     Column("travel_time", "float64", "s", "from start to end of the run"),
     Column("mean_speed", "float64", "m/s", "distance / travel time"),
-    Column("speed_gap_closed", "float64", "", "share of the humans' gap to the limit; see docs"),
+    Column(
+        "speed_gap_closed",
+        "float64",
+        "",
+        "share of the humans' gap to the limit, 5 to 15 s after the start",
+    ),
     Column("max_excess_speed", "float64", "m/s", "largest, over the mean of the humans in 80 m"),
     Column("max_lateral_shift", "float64", "m", "largest distance across from where it started"),
     Column("max_speed_shift", "float64", "m/s", "largest difference from the limit"),
@@ -144,6 +149,14 @@ METRICS = (
     Column("plan_ms_median", "float64", "ms", "planner's call, median"),
     Column("plan_ms_p99", "float64", "ms", "planner's call, 99th percentile"),
 )
+
+OF_REFERENCE = (
+    "plan_lateral_change",
+    "plan_speed_change",
+    "twin_lateral_deviation",
+    "twin_speed_deviation",
+)
+"""Metrics that need a scenario's ``reference``."""
 
 TABLES = {
     "trajectory": TRAJECTORY,

@@ -50,7 +50,7 @@ def run_metrics(
         "distance": distance,
         "travel_time": float(end - start),
         "mean_speed": distance / float(end - start),
-        "speed_gap_closed": speed_gap_closed(ego, others, plan),
+        "speed_gap_closed": speed_gap_closed(ego, humans, plan),
         "speed_most_agreed": speed_most_agreed(agreement),
         **reference_metrics(ego, reference),
         "max_excess_speed": max_excess_speed(ego, humans),
@@ -98,16 +98,16 @@ def off_road(ego: pd.DataFrame, plan: pd.DataFrame) -> bool:
     return bool(beyond.any())
 
 
-def speed_gap_closed(ego: pd.DataFrame, others: pd.DataFrame, plan: pd.DataFrame) -> float:
-    """Share of the gap between the limit and the others' speed that the ego closed.
+def speed_gap_closed(ego: pd.DataFrame, humans: pd.DataFrame, plan: pd.DataFrame) -> float:
+    """Share of the gap between the limit and the humans' speed that the ego closed.
 
-    (ego - limit) / (others - limit), of means over 5 s to 15 s after the start, when the ego has
-    had time to adapt and the others are still near; others are those it sees within 80 m. NaN
+    (ego - limit) / (humans - limit), of means over 5 s to 15 s after the start, when the ego has
+    had time to adapt and the humans are still near: those it sees within 80 m. NaN
     if they differ from the limit by less than 0.5 m/s, or there are none.
     """
     start = float(ego["time"].iloc[0])
     own = ego[ego["time"].between(start + 5.0, start + 15.0)]
-    near = others[others["visible"]].merge(own[["time", "s"]], on="time", suffixes=("", "_ego"))
+    near = humans[humans["visible"]].merge(own[["time", "s"]], on="time", suffixes=("", "_ego"))
     near = near[(near["s"] - near["s_ego"]).abs() <= 80.0]
     if near.empty:
         return np.nan
@@ -140,9 +140,9 @@ def speed_most_agreed(agreement: pd.DataFrame) -> float:
     in which the group has enough cars count; NaN if there are none.
     """
     road = agreement[(agreement["group"] == "road") & agreement["precision"].notna()]
-    by_feature = road.pivot(index="time", columns="feature", values="precision")
-    if by_feature.empty:
-        return np.nan
+    by_feature = road.pivot_table(index="time", columns="feature", values="precision")
+    if not {"distance", "longitudinal"} < set(by_feature.columns):
+        return np.nan  # none, or those of a planner that has other features
     of_speed = by_feature[["distance", "longitudinal"]].min(axis=1)
     others = by_feature.drop(columns=["distance", "longitudinal"]).max(axis=1)
     return float((of_speed > others).mean())
@@ -151,7 +151,7 @@ def speed_most_agreed(agreement: pd.DataFrame) -> float:
 def reference_metrics(ego: pd.DataFrame, reference: pd.DataFrame) -> dict[str, float]:
     """Say what cohesion changed: largest absolute values over the run; NaN without a reference.
 
-    plan_*: after one horizon, against the nominal plan from the same state. twin_*: against a
+    plan_*: within one horizon, against the nominal plan from the same state. twin_*: against a
     nominal car that started as the ego did and drove through the same traffic on its own.
     nominal_*, against nominal's own run of the same seed, needs that run: compare() fills it in.
     """
@@ -250,7 +250,9 @@ def aside_share(info: Mapping[str, Any], ego: pd.DataFrame, others: pd.DataFrame
     lane = start["lane"] == ego["lane"].iloc[0]
     names = start["vehicle"][lane & ~start["vehicle"].isin(not_human)]
     ways = [_way_aside(others[others["vehicle"] == name], special) for name in names]
-    mean = float(np.mean(ways)) if ways else np.nan
+    # Who was out of sight before the special vehicle came into it says nothing.
+    known = [way for way in ways if not np.isnan(way)]
+    mean = float(np.mean(known)) if known else np.nan
     return _way_aside(ego, special) / mean if abs(mean) >= 0.3 else np.nan
 
 

@@ -4,7 +4,8 @@ Two answers, because each alone misleads. *Plan*: from the very state the ego is
 nominal planner plan? That is what cohesion changes in one horizon. *Twin*: a nominal car that
 started where the ego started and has driven on its own ever since, through the traffic of this
 run. That adds up over the run, and unlike a run of its own it meets the very same humans: they
-react to the ego, not to the twin.
+react to the ego, not to the twin. It is a ghost: nothing stops it but its own planner, and it sees
+only the vehicles that the ego's surroundings hold.
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ class Reference:
             change = plan.states - nominal.states
             lateral, speed = change[np.abs(change).argmax(axis=0), range(4)][[1, 3]]
         else:
-            lateral = speed = np.nan  # a car that SUMO drives has no plan to compare
+            lateral = speed = np.nan  # SUMO drives, or the plan is a fallback: nothing to compare
         twin = self._sensor.observe(replace(scene, ego=self._twin or scene.ego))
         self.rows.append(
             {

@@ -11,7 +11,7 @@ from typing import Annotated, Any, TypeVar
 from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, ValidationError, model_validator
 
 from sumo_cohesion.errors import UserError
-from sumo_cohesion.experiments.columns import METRICS
+from sumo_cohesion.experiments.columns import METRICS, OF_REFERENCE
 from sumo_cohesion.planning.settings import PlannerSettings
 from sumo_cohesion.social.settings import CohesionSettings
 from sumo_cohesion.traffic.demand import EgoDemand, Randomization
@@ -86,10 +86,21 @@ class Scenario(_Data):
 
     @model_validator(mode="after")
     def _known_metrics(self) -> Scenario:
-        names = [c.name for c in METRICS]
-        for name in self.success:
-            if name not in names:
-                raise ValueError(f"success: there is no metric {name!r}{_closest(name, names)}")
+        kinds = {c.name: c.dtype for c in METRICS}
+        for name, wanted in self.success.items():
+            if name not in kinds:
+                raise ValueError(f"success: there is no metric {name!r}{_closest(name, [*kinds])}")
+            if name == "success":
+                raise ValueError("success cannot be a condition of itself; name another metric")
+            if name.startswith("nominal_"):
+                raise ValueError(
+                    f"success: {name} is known only beside nominal's own run, by compare; use "
+                    f"{name.replace('nominal', 'twin')}"
+                )
+            if name in OF_REFERENCE and not self.reference:
+                raise ValueError(f"success: {name} needs reference = true")
+            if isinstance(wanted, Bounds) and kinds[name] in ("string", "bool"):
+                raise ValueError(f"success: {name} is no number and has no min and max")
         return self
 
     def file(self, name: str, kind: str) -> Path:

@@ -228,12 +228,12 @@ def explain(
         for name, m, v, w, o in zip(FEATURES, g.mean, g.variance, g.weight, own, strict=True)
     ]
     if any(place.weight):
-        mean, variance, weight = place.mean[0] / PLACE_SCALE, place.variance[0], place.weight[0]
-        pull = beta * weight * (mean - d / PLACE_SCALE) ** 2
+        # The nearest place that is known.
+        i = next(i for i, weight in enumerate(place.weight) if weight > 0.0)
+        mean, here, weight = place.mean[i] / PLACE_SCALE, d / PLACE_SCALE, place.weight[i]
+        pull = beta * weight * (mean - here) ** 2
         rows.append(
-            AgreementRow(
-                "position", "place", place.n, mean, variance, weight, d / PLACE_SCALE, pull
-            )
+            AgreementRow("position", "place", place.n, mean, place.variance[i], weight, here, pull)
         )
     return tuple(rows)
 

@@ -173,7 +173,7 @@ def _draw_parting(axes: Sequence[Axes], pair: tuple[Rollout, Rollout]) -> None:
 
 def _draw_beside(axes: Sequence[Axes], pair: tuple[Rollout, Rollout]) -> None:
     """Draw what happens around a car at the speed limit that starts where the ego does."""
-    start = max(float(time) for time in pair[0].info["events"].values())
+    start = _alarm(pair[0])
     times = np.linspace(start, start + PASSING, INSTANTS).tolist()
     for axis, rollout in zip(axes, pair, strict=True):
         moving = _beside(rollout)
@@ -191,6 +191,21 @@ def _draw_beside(axes: Sequence[Axes], pair: tuple[Rollout, Rollout]) -> None:
     axes[1].set_xlim(*BESIDE)
     axes[1].set_xlabel("ahead of a car that keeps the speed limit [m]")
     _say_instants(axes, times)
+
+
+def _alarm(rollout: Rollout) -> float:
+    """Time (s) of the first event near the ego; without one, half a view before it is passed."""
+    events = rollout.info["scenario"]["events"]
+    times = rollout.info["events"]
+    near = [times[str(i)] for i, e in enumerate(events) if e["near"] and str(i) in times]
+    if near:
+        return float(min(near))
+    special = rollout.trajectory[rollout.trajectory["vehicle"].isin(rollout.info["special"])]
+    both = special.merge(ego_of(rollout), on="time", suffixes=("", "_ego"))
+    if both.empty:
+        return float(rollout.trajectory["time"].iloc[0])
+    nearest = float(both["time"].iloc[int((both["s"] - both["s_ego"]).abs().argmin())])
+    return max(nearest - PASSING / 2, float(rollout.trajectory["time"].iloc[0]))
 
 
 def _beside(rollout: Rollout) -> Rollout:

@@ -97,7 +97,7 @@ def _draw_pull(axis: Axes, rollout: Rollout) -> None:
     """Show which group's steering features pulled, where the ego then was."""
     ego = ego_of(rollout)[["time", "s"]]
     steering = rollout.agreement[
-        rollout.agreement["feature"].isin(["lateral", "heading", "direction"])
+        rollout.agreement["feature"].isin(["lateral", "heading", "direction", "place"])
     ]
     pull = steering.groupby(["time", "group"], sort=False)["pull"].sum().unstack("group")
     at = ego.set_index("time")["s"].reindex(pull.index)

@@ -68,9 +68,10 @@ def _agree(group: str, votes: Sequence[Vote], settings: CohesionSettings) -> Agr
 def estimate(values: Sequence[float], habits: Sequence[float], floor: float) -> tuple[float, float]:
     """Mean and variance of what n >= 2 drivers do, each counting by its own reliability.
 
-    With weights q = 1 / (floor + habit): mean = sum q x / sum q, and variance = unbiased
-    weighted sample variance + n / sum q - floor. The last part is what these drivers vary by
-    anyway. Without habits (all zero) this is the paper's plain sample mean and variance.
+    With weights q = 1 / (floor + habit): mean = sum q x / sum q, and variance = weighted sample
+    variance · n / (n - 1), which is unbiased for equal weights, + n / sum q - floor. The last
+    part is what these drivers vary by anyway. Without habits (all zero) this is the paper's plain
+    sample mean and variance.
 
     >>> estimate([0.0, 2.0], [0.0, 0.0], floor=0.01)
     (1.0, 2.0)

@@ -3,7 +3,7 @@
 The paper's features are differences, so a car that lags behind a swerve is told to straighten
 when the others straighten, and ends up beside their path. Here the ego also sees where across the
 road those drove who had come along where it came along, at its own place and at those ahead, and
-follows that as it follows the other features: by mean and sample variance.
+follows that as it follows the other features: by mean and variance, habits included.
 """
 
 from __future__ import annotations
@@ -14,11 +14,13 @@ from typing import NamedTuple
 from sumo_cohesion.perception.history import History, Track
 from sumo_cohesion.road import Road
 from sumo_cohesion.social.agreement import estimate
+from sumo_cohesion.social.features import FEATURES
 from sumo_cohesion.social.settings import CohesionSettings
 from sumo_cohesion.state import RoadState
 
 SCALE = 3.5
 """Metres by which positions across the road are normalised: a lane's width."""
+_LATERAL = FEATURES.index("lateral")
 
 
 class Place(NamedTuple):
@@ -81,7 +83,8 @@ def _companions(
     """Cars that were beside the ego's own path some way back, and have passed it since.
 
     With the variance of their lateral feature up to there: what they have done since is what they
-    are asked about.
+    are asked about. It stands for how little their place can be relied on, though it is one of
+    lateral speeds.
     """
     path = history.ego_path
     back = max(ego.s - settings.place_look_back, path.first)
@@ -92,5 +95,5 @@ def _companions(
         s = max(back, track.middle_s[0])
         d = track.across(s)
         if d is not None and abs(d - path.at(s)) <= settings.position_width:
-            companions.append((track, track.habit_at(s)[0]))
+            companions.append((track, track.habit_at(s)[_LATERAL]))
     return companions

@@ -24,9 +24,11 @@ class CohesionSettings(BaseModel):
         "most_surprising": only the group whose agreement contradicts lane keeping most.
     surprise : lateral agreement counts only if it contradicts lane keeping by more than this
         (largest sum of weight · mean²); what lane keeping does anyway is no news.
-    surprise_hold : seconds for which any contradiction counts once there was such a surprise.
+    surprise_hold : seconds for which a contradiction above 1 counts, once there was such a
+        surprise.
     speed_weight : weight of the features that set the speed, relative to those that steer.
-    habit : seconds of a driver's own past whose variance adds to the group's; zero: none.
+    habit : seconds of a driver's own past whose variance adds to the group's, in whole
+        intervals; zero: none.
     habit_delay : the newest seconds, which do not count as its past yet.
     place_weight : weight of the lateral position at a place (social.place), relative to the
         features that steer; zero switches it off.

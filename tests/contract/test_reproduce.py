@@ -26,6 +26,12 @@ def test_a_case_is_run_once_and_its_claims_counted(
     about = json.loads((tmp_path / "out" / "reproduce.json").read_text())
     assert about["cases"] == {"speeding": {"scenario": "speeding"}}
     assert len(pd.read_parquet(tmp_path / "out" / "runs.parquet")) == 2 * len(reproduce.PLANNERS)
+    # What was kept is known by all that it stands for, not by its first and last seed.
+    names = {
+        reproduce._file_name("speeding", reproduce.CASES["speeding"], reproduce.PLANNERS, part)
+        for part in ([1000, 1001], [1000, 1003, 1001], [1000, 1001, 1001])
+    }
+    assert len(names) == 3
     capsys.readouterr()
     before = (tmp_path / "out" / "claims.csv").read_bytes()
     reproduce.main(command + folders)
@@ -36,6 +42,11 @@ def test_a_case_is_run_once_and_its_claims_counted(
 def test_an_unknown_case_is_named(tmp_path: Path) -> None:
     with pytest.raises(SystemExit, match="no case 'stahled'"):
         reproduce.main(["--cases", "stahled", "--out", str(tmp_path)])
+
+
+def test_a_part_of_the_cases_does_not_replace_the_evidence() -> None:
+    with pytest.raises(SystemExit, match="another --out"):
+        reproduce.main(["--cases", "speeding"])
 
 
 def test_a_rate_meets_its_target_or_does_not() -> None:

@@ -42,8 +42,12 @@ def test_ambulance_nominal_holds_it_up_and_cohesive_makes_way() -> None:
 
 
 def test_same_speed_only_the_speed_is_followed() -> None:
-    row = run("same_speed", "cohesive", 1000).metrics.iloc[0]
-    assert row["success"]
+    nominal = run("same_speed", "nominal", 1000).metrics.iloc[0]
+    cohesive = run("same_speed", "cohesive", 1000).metrics.iloc[0]
+    assert not nominal["success"]
+    assert nominal["speed_gap_closed"] == pytest.approx(0.0, abs=0.1)
+    assert cohesive["success"]
+    assert cohesive["speed_most_agreed"] > 0.95
 
 
 def test_rescue_lane_nominal_blocks_it_and_cohesive_lets_the_ambulance_through() -> None:

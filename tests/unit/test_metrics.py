@@ -233,3 +233,12 @@ def test_speed_gap_closed_by_hand() -> None:
     assert metrics.speed_gap_closed(ego, other, plan) == pytest.approx(0.6)
     other["visible"] = False
     assert np.isnan(metrics.speed_gap_closed(ego, other, plan))
+
+
+def test_aside_share_does_without_a_human_that_was_out_of_sight_too_soon() -> None:
+    ambulance = car("ambulance", 25.0 * TIME)
+    ego, human = car("ego", 100.0 + 20.0 * TIME), car("human", 150.0 + 20.0 * TIME)
+    ego["d"], human["d"] = 0.1 * TIME, 0.2 * TIME
+    gone = car("gone", 300.0 + 20.0 * TIME)[:3]
+    others = pd.concat([ambulance[5:], human, gone])
+    assert metrics.aside_share(RESCUE, ego, others) == pytest.approx(0.5)

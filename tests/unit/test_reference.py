@@ -32,7 +32,7 @@ def test_cohesive_speeds_up_and_its_twin_does_not() -> None:
 def test_a_car_that_sumo_drives_has_no_plan_to_compare() -> None:
     row = run("same_speed", "sumo", 1000, overrides={**SHORT, "duration": 2.0}).metrics.iloc[0]
     assert np.isnan(row["plan_lateral_change"])
-    assert row["twin_speed_deviation"] >= 0.0
+    assert np.isfinite(row["twin_speed_deviation"])
 
 
 def test_without_a_reference_nothing_is_claimed() -> None:
