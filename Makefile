@@ -50,7 +50,7 @@ reproduce: $(VENV)/.installed
 	$(BIN)/python -m analysis.markdown
 	$(BIN)/python analysis/figures.py
 
-# What each addition to the printed formula is worth: about a quarter of an hour.
+# What each addition to the printed formula is worth: about ten minutes.
 ablation: $(VENV)/.installed
 	$(BIN)/python -m analysis.ablation
 	$(BIN)/python -m analysis.markdown

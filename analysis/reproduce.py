@@ -71,13 +71,20 @@ def _success(runs: pd.DataFrame) -> pd.Series:
     return runs["success"]
 
 
+def _hits_hidden(runs: pd.DataFrame) -> pd.Series:
+    return runs["collision"] & ~runs["collision_visible"]
+
+
+CLEAN = ["stalled", "stalled_swerve", "stalled, leads 40 m apart"]
+HARDER = [case for case in CASES if case.startswith("stalled") and case not in CLEAN]
 CLAIMS = (
     Claim(
         "collides with the stalled car",
-        [case for case in CASES if case.startswith("stalled")],
-        lambda r: r["collision"] & ~r["collision_visible"],
+        CLEAN,
+        _hits_hidden,
         {"nominal": ">= 0.95", "cohesive": "<= 0.03"},
     ),
+    Claim("collides with the stalled car", HARDER, _hits_hidden, {}),
     Claim(
         "holds the ambulance up by 2.5 s or more",
         ["ambulance"],
