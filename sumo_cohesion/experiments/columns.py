@@ -134,7 +134,10 @@ METRICS = (
     Column("passing_lane", "float64", "", "ego's lane as the special vehicle passes; NaN if never"),
     Column("passing_shift", "float64", "m", "ego's way to the left from its start until then"),
     Column(
-        "aside_share", "float64", "", "ego's way aside over that of its lane's humans; see docs"
+        "aside_share",
+        "float64",
+        "",
+        "ego's way aside over that of its lane's humans, 0.3 m or more",
     ),
     Column("lane_changes", "int64", "", "changes of the ego's nearest lane"),
     Column("min_gap", "float64", "m", "smallest bumper-to-bumper gap to a car ahead in its path"),
