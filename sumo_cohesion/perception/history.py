@@ -104,6 +104,10 @@ class Track:
         """Which transitions have their middle within ``reach`` (m) of s; cars do not reverse."""
         return slice(bisect_left(self.middle_s, s - reach), bisect_right(self.middle_s, s + reach))
 
+    def passed_by(self, s: float) -> bool:
+        """Tell whether the car was seen on both sides of s, driving forwards."""
+        return bool(self.middle_s) and self.middle_s[0] <= s < self.middle_s[-1]
+
     def across(self, s: float) -> float | None:
         """Where across the road (d, m) the car was when it passed s; None if that is unknown."""
         after = bisect_right(self.middle_s, s)

@@ -131,11 +131,14 @@ class CohesivePlanner:
             weight[:, 0] = self.cohesion.beta * np.array(term.weight)
             target[:, 0] = term.target
         place_weight, place_target = np.zeros((2, horizon))
-        if place.n:
+        if any(place.weight):
             stages = np.arange(1, horizon + 1)
-            place_weight = np.interp(stages, self._place_steps, place.weight)
+            steps, asked = np.array(self._place_steps), np.array(place.weight)
+            known = asked > 0.0
+            place_weight = np.interp(stages, steps, asked)
             place_weight *= self.cohesion.beta / PLACE_SCALE**2
-            place_target = np.interp(stages, self._place_steps, place.mean)
+            # Between a known place and an unknown one the known one counts, ever less.
+            place_target = np.interp(stages, steps[known], np.array(place.mean)[known])
         return Problem(
             ego=np.array(ego),
             ego_width=np.array([observation.ego_size[1]]),

@@ -68,23 +68,25 @@ def _agree(group: str, votes: Sequence[Vote], settings: CohesionSettings) -> Agr
 def estimate(values: Sequence[float], habits: Sequence[float], floor: float) -> tuple[float, float]:
     """Mean and variance of what n >= 2 drivers do, each counting by its own reliability.
 
-    With weights q = 1 / (floor + habit): mean = sum q x / sum q, and variance = weighted sample
-    variance · n / (n - 1), which is unbiased for equal weights, + n / sum q - floor. The last
-    part is what these drivers vary by anyway. Without habits (all zero) this is the paper's plain
-    sample mean and variance.
+    With weights q = 1 / (floor + habit): mean = sum q x / sum q, and variance = unbiased weighted
+    sample variance (reliability weights: divided by 1 - sum q² / (sum q)²) + n / sum q - floor.
+    The last part is what these drivers vary by anyway. Without habits (all zero) this is the
+    paper's plain sample mean and variance.
 
     >>> estimate([0.0, 2.0], [0.0, 0.0], floor=0.01)
     (1.0, 2.0)
     """
-    total = weighted = squares = 0.0
+    total = total_squared = weighted = squares = 0.0
     for x, habit in zip(values, habits, strict=True):
         q = 1.0 / (floor + habit)
         total += q
+        total_squared += q * q
         weighted += q * x
         squares += q * x * x
     n, mean = len(values), weighted / total
     spread = max(squares / total - mean * mean, 0.0)
-    return mean, spread * n / (n - 1) + max(n / total - floor, 0.0)
+    unbiased = spread / (1.0 - total_squared / (total * total))
+    return mean, unbiased + max(n / total - floor, 0.0)
 
 
 def combine(groups: Sequence[Agreement]) -> CohesionTerm:

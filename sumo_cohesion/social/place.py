@@ -80,19 +80,21 @@ def agree_on_place(
 def _companions(
     ego: RoadState, history: History, settings: CohesionSettings
 ) -> list[tuple[Track, float]]:
-    """Cars that were beside the ego's own path some way back, and have passed it since.
+    """Cars that were beside the ego's own path, and have passed the ego's place since.
+
+    Some way back, or where they came into sight if that is nearer; who came into sight ahead of
+    the ego may have come from anywhere.
 
     With the variance of their lateral feature up to there: what they have done since is what they
     are asked about. It stands for how little their place can be relied on, though it is one of
     lateral speeds.
     """
     path = history.ego_path
-    back = max(ego.s - settings.place_look_back, path.first)
     companions = []
     for track in history.all():
-        if not track.voter or not track.middle_s or track.middle_s[-1] <= ego.s:
+        if not track.voter or not track.passed_by(ego.s):
             continue
-        s = max(back, track.middle_s[0])
+        s = max(ego.s - settings.place_look_back, path.first, track.middle_s[0])
         d = track.across(s)
         if d is not None and abs(d - path.at(s)) <= settings.position_width:
             companions.append((track, track.habit_at(s)[_LATERAL]))
