@@ -60,4 +60,5 @@ class Reference:
         )
         control = self._of_twin.plan(twin, history).controls[0]
         state = self._twin or scene.ego
-        self._twin = CartesianState(*dynamics.step(state, control, dynamics.DT, self._friction))
+        x, y, heading, speed = dynamics.step(state, control, dynamics.DT, self._friction)
+        self._twin = CartesianState(x, y, heading, max(speed, 0.0))

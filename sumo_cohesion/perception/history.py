@@ -7,6 +7,7 @@ the simulation has run.
 
 from __future__ import annotations
 
+from array import array
 from bisect import bisect_left, bisect_right
 from collections import deque
 from collections.abc import Callable, Collection, Sequence
@@ -53,8 +54,8 @@ class Track:
         self.step = -2
         self.state: State = (0.0, 0.0, 0.0, 0.0)
         self.steps: list[int] = []
-        self.middle_s: list[float] = []
-        self.middle_d: list[float] = []
+        self.middle_s = array("d")  # side by side in memory: searched at every step
+        self.middle_d = array("d")
         self.features: list[Features] = []
         self.habits: list[Features] = []
         self._habit = habit
@@ -100,9 +101,10 @@ class Track:
             return self.features[-1]
         return None
 
-    def passed(self, s: float, reach: float) -> slice:
+    def passed(self, s: float, reach: float) -> range:
         """Which transitions have their middle within ``reach`` (m) of s; cars do not reverse."""
-        return slice(bisect_left(self.middle_s, s - reach), bisect_right(self.middle_s, s + reach))
+        first = bisect_left(self.middle_s, s - reach)
+        return range(first, bisect_right(self.middle_s, s + reach, first))
 
     def passed_by(self, s: float) -> bool:
         """Tell whether the car was seen on both sides of s, driving forwards."""
@@ -123,8 +125,8 @@ class Track:
 
     def forget(self, before: int) -> None:
         """Drop transitions that ended before a step."""
-        old = bisect_left(self.steps, before)
-        if old:
+        if self.steps and self.steps[0] < before:
+            old = bisect_left(self.steps, before)
             for series in (
                 self.steps,
                 self.middle_s,

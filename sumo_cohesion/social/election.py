@@ -16,6 +16,7 @@ from sumo_cohesion.social.features import LATERAL
 from sumo_cohesion.social.place import Place
 from sumo_cohesion.social.settings import CohesionSettings
 
+_STEERING = [i for i, lateral in enumerate(LATERAL) if lateral]
 _STILL_NEWS = 1.0
 """Surprise that is enough as long as a greater one is remembered."""
 
@@ -57,11 +58,13 @@ def surprise_of(group: Agreement, place: Place) -> float:
 
     The position group's place counts with it.
     """
-    terms = zip(group.weight, group.mean, LATERAL, strict=True)
-    features = sum([w * m * m for w, m, lateral in terms if lateral])
+    weight, mean = group.weight, group.mean
+    features = sum([weight[i] * mean[i] * mean[i] for i in _STEERING])
     return features + (place.surprise if group.group == "position" else 0.0)
 
 
 def _silent(group: Agreement) -> Agreement:
-    weight = [0.0 if lateral else w for w, lateral in zip(group.weight, LATERAL, strict=True)]
-    return group._replace(weight=tuple(weight))
+    weight = tuple(
+        [0.0 if lateral else w for w, lateral in zip(group.weight, LATERAL, strict=True)]
+    )
+    return Agreement(group.group, group.n, group.mean, group.variance, weight)

@@ -58,16 +58,11 @@ def group_votes(ego: RoadState, history: History, road: Road, settings: Cohesion
 
 def _vote_at_place(track: Track, ego: RoadState, settings: CohesionSettings) -> Vote | None:
     """Mean features of one car's transitions around the ego's place; None if it kept aside."""
+    across, d, width = track.middle_d, ego.d, settings.position_width
     passed = track.passed(ego.s, settings.position_length)
-    samples = [
-        (features, habit)
-        for features, habit, d in zip(
-            track.features[passed], track.habits[passed], track.middle_d[passed], strict=True
-        )
-        if abs(d - ego.d) <= settings.position_width
-    ]
-    if not samples:
+    here = [i for i in passed if abs(across[i] - d) <= width]
+    if not here:
         return None
-    features, habits = zip(*samples, strict=True)
-    n = len(samples)
-    return Vote(tuple([sum(column) / n for column in zip(*features, strict=True)]), habits[0])
+    n = len(here)
+    columns = zip(*[track.features[i] for i in here], strict=True)
+    return Vote(tuple([sum(column) / n for column in columns]), track.habits[here[0]])

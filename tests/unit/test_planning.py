@@ -22,7 +22,7 @@ from sumo_cohesion.planning.planners import (
 from sumo_cohesion.planning.settings import PlannerSettings
 from sumo_cohesion.road import Road
 from sumo_cohesion.social.memory import new_history
-from sumo_cohesion.social.place import NOWHERE
+from sumo_cohesion.social.place import NOWHERE, Place
 from sumo_cohesion.social.settings import CohesionSettings
 from sumo_cohesion.state import Observation, RoadState
 
@@ -185,6 +185,18 @@ def test_a_lagging_ego_is_drawn_to_the_others_path(highway: Road) -> None:
     assert moved[8.0] > 0.1
     (row,) = [r for r in plan.agreement if r.feature == "place"]
     assert (row.n, row.mean * 3.5) == pytest.approx((3, 1.6))
+
+
+def test_only_a_known_place_pulls(highway: Road) -> None:
+    planner = CohesivePlanner(SETTINGS, CohesionSettings())
+    planner.reset(highway)
+    n = len(planner._place_steps)
+    unknown = (0.0,) * (n - 1)
+    place = Place(2, (1.6, *[0.4] * (n - 1)), (0.0, *unknown), (400.0, *unknown), 9.0)
+    problem = planner._problem(observation((300.0, 0.4, 0.0, 25.0), []), (), place)
+    assert problem.place_target == pytest.approx(np.full(SETTINGS.horizon, 1.6))
+    assert problem.place_weight[0] == problem.place_weight.max() > 0.0
+    assert (problem.place_weight[planner._place_steps[1] - 1 :] == 0.0).all()
 
 
 def test_beta_zero_is_the_nominal_planner(highway: Road) -> None:

@@ -165,13 +165,12 @@ def test_groups_who_votes_where(highway: Road) -> None:
 def test_special_and_oncoming_vehicles_do_not_vote(highway: Road) -> None:
     h = history()
     for k in range(10):
-        cars = {"ambulance": (300 + 3.0 * k, 0.0, 30.0), "oncoming": (330 - 3.0 * k, 3.5, 30.0)}
+        cars = {"ambulance": (300 + 3.0 * k, 0.0, 30.0), "oncoming": (315 - 3.0 * k, 2.0, 30.0)}
         observation = observe(0.1 * k, cars, special="ambulance")
         observation.states[1, 2] = np.pi
         h.push(observation)
     votes = group_votes(RoadState(300.0, 0.0, 0.0, 25.0), h, highway, SETTINGS)
-    assert votes == {"position": votes["position"], "lane": [], "road": []}
-    assert len(votes["position"]) <= 1
+    assert votes == {"position": [], "lane": [], "road": []}
 
 
 def test_agreement_is_mean_and_unbiased_variance() -> None:
@@ -192,10 +191,11 @@ def test_perfect_agreement_has_the_floors_weight() -> None:
 
 
 def test_a_driver_counts_by_its_habits_and_the_group_is_no_surer_than_its_members() -> None:
-    # q = 1 / (floor + habit) = 10 and 2: mean 2/12, spread (10/36 + 50/36) / 12 · 2, n/Q 1/6.
+    # q = 1 / (floor + habit) = 10 and 2: mean 2/12; two drivers' unbiased variance is half their
+    # squared distance, whatever they weigh; n / sum q = 1/6.
     mean, variance = estimate([0.0, 1.0], [0.09, 0.49], floor=0.01)
     assert mean == pytest.approx(1 / 6)
-    assert variance == pytest.approx(60 / 36 / 12 * 2 + 2 / 12 - 0.01)
+    assert variance == pytest.approx(0.5 + 2 / 12 - 0.01)
     # However well they agree, drivers with a habit of 0.09 weigh 1 / (0.09 + floor) at most.
     votes = [Vote((0.5,) * 5, (0.09,) * 5)] * 3
     (group,) = agree({"road": votes}, SETTINGS)
@@ -304,6 +304,21 @@ def test_who_did_not_come_along_has_no_say_on_the_place(highway: Road) -> None:
     h = come_along(0.0, {c: (s, 7.0, 25.0, 0.0) for c, s in (("a", 270.0), ("b", 250.0))})
     place = agree_on_place(RoadState(297.5, 0.0, 0.0, 25.0), h, highway, [0.1], SETTINGS)
     assert place == NOWHERE
+
+
+def test_who_was_first_seen_ahead_may_have_come_from_anywhere(highway: Road) -> None:
+    h = come_along(0.0, {c: (s, 1.6, 25.0, 0.0) for c, s in (("a", 310.0), ("b", 320.0))})
+    place = agree_on_place(RoadState(297.5, 0.0, 0.0, 25.0), h, highway, [0.1], SETTINGS)
+    assert place == NOWHERE
+
+
+def test_beyond_where_the_others_are_now_their_place_is_unknown(highway: Road) -> None:
+    # They are at 317.5 and 307.5, and both are known to just behind 305.
+    h = come_along(0.0, {c: (s, 1.6, 25.0, 0.0) for c, s in (("a", 180.0), ("b", 170.0))}, 56)
+    ego = RoadState(297.5, 0.2, 0.0, 25.0)
+    place = agree_on_place(ego, h, highway, [0.1, 0.5], SETTINGS)
+    assert place.weight == pytest.approx((400.0, 0.0))
+    assert place.mean[0] == pytest.approx(1.6)
 
 
 def test_combined_term_differs_from_the_groups_sum_by_a_constant() -> None:
