@@ -24,10 +24,9 @@ import pandas as pd
 
 import sumo_cohesion
 from sumo_cohesion import compare
-from sumo_cohesion.cli import parse_seeds
 from sumo_cohesion.errors import SimulationError, UserError
 from sumo_cohesion.experiments.rollout import versions
-from sumo_cohesion.experiments.scenario import bundled
+from sumo_cohesion.experiments.scenario import bundled, parse_seeds
 from sumo_cohesion.experiments.statistics import wilson
 
 HERE = Path(__file__).resolve().parent

@@ -9,8 +9,10 @@ import importlib
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from sumo_cohesion.batches.batch import batch
+    from sumo_cohesion.batches.results import load_metrics, load_trajectories
     from sumo_cohesion.errors import SimulationError, UserError
-    from sumo_cohesion.experiments.comparison import Comparison, compare, load_metrics
+    from sumo_cohesion.experiments.comparison import Comparison, compare
     from sumo_cohesion.experiments.export import export_scenario
     from sumo_cohesion.experiments.rollout import Rollout
     from sumo_cohesion.experiments.scenario import load_scenario
@@ -21,10 +23,12 @@ _HOME = {
     "Rollout": "experiments.rollout",
     "SimulationError": "errors",
     "UserError": "errors",
+    "batch": "batches.batch",
     "compare": "experiments.comparison",
     "export_scenario": "experiments.export",
-    "load_metrics": "experiments.comparison",
+    "load_metrics": "batches.results",
     "load_scenario": "experiments.scenario",
+    "load_trajectories": "batches.results",
     "run": "experiments.simulation",
 }
 
@@ -33,10 +37,12 @@ __all__ = [
     "Rollout",
     "SimulationError",
     "UserError",
+    "batch",
     "compare",
     "export_scenario",
     "load_metrics",
     "load_scenario",
+    "load_trajectories",
     "run",
 ]
 

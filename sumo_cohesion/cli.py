@@ -92,6 +92,7 @@ def compare(
 ) -> None:
     """Run several planners on the same seeds of SCENARIO and compare them."""
     from sumo_cohesion.experiments.comparison import compare as compare_planners
+    from sumo_cohesion.experiments.scenario import parse_seeds
     from sumo_cohesion.report.paths import draw_comparison
 
     folder = out if out is not None else Path("results") / Path(scenario).stem
@@ -130,7 +131,7 @@ def compare(
 @click.option("--out", type=click.Path(path_type=Path), help="File to write (parquet needs it).")
 def metrics(folder: Path, style: str, out: Path | None) -> None:
     """Print or convert the metrics of all runs below FOLDER."""
-    from sumo_cohesion.experiments.comparison import load_metrics
+    from sumo_cohesion.batches.results import load_metrics
 
     frame = load_metrics(folder)
     if style == "parquet":
@@ -182,25 +183,6 @@ def export(name: str, seed: int, changes: tuple[str, ...], out: Path) -> None:
     from sumo_cohesion.experiments.export import export_scenario
 
     click.echo(export_scenario(name, out, seed=seed, overrides=_overrides(changes)))
-
-
-def parse_seeds(text: str) -> list[int]:
-    """Parse "0:20" (half-open) or "3,7,9".
-
-    >>> parse_seeds("0:3"), parse_seeds("3,7,9")
-    ([0, 1, 2], [3, 7, 9])
-    """
-    try:
-        if ":" in text:
-            low, high = (int(part) for part in text.split(":"))
-            seeds = list(range(low, high))
-        else:
-            seeds = [int(part) for part in text.split(",")]
-    except ValueError:
-        raise UserError(f"--seeds {text!r}: write 0:20 for 0 to 19, or a list 3,7,9") from None
-    if not seeds:
-        raise UserError(f"--seeds {text!r} is empty; 0:20 means 0 to 19, the end is not included")
-    return seeds
 
 
 def _overrides(changes: Sequence[str]) -> dict[str, Any]:

@@ -10,3 +10,7 @@ class UserError(Exception):
 
 class SimulationError(Exception):
     """SUMO did something that would make the results untrue; the message is one line."""
+
+
+class StorageError(UserError):
+    """The disk is full or a folder cannot be written; the message is one line."""

@@ -22,10 +22,11 @@ ALLOWED = {
     "social": SHARED | {"perception"},
     "planning": SHARED | {"perception", "social"},
     "experiments": SHARED | {"traffic", "perception", "social", "planning"},
-    "report": SHARED | {"experiments"},
-    "cli": {"errors", "experiments", "report"},
+    "batches": SHARED | {"traffic", "social", "planning", "experiments"},
+    "report": SHARED | {"experiments", "batches"},
+    "cli": {"errors", "experiments", "batches", "report"},
     "__main__": {"cli"},
-    "__init__": {"errors", "experiments"},
+    "__init__": {"errors", "experiments", "batches"},
 }
 OUTSIDE = {
     "libsumo": {"traffic"},

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import json
-import multiprocessing
 import os
 import shutil
-import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
+from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -23,6 +20,7 @@ from sumo_cohesion.experiments.rollout import RUN_FILE, Rollout, require_replace
 from sumo_cohesion.experiments.setup import prepare
 from sumo_cohesion.experiments.simulation import simulate
 from sumo_cohesion.experiments.statistics import summarize
+from sumo_cohesion.experiments.workers import NO_LIMITS, CallFailedError, Workers
 from sumo_cohesion.planning.planners import Planner, make_planner
 from sumo_cohesion.planning.settings import PlannerSettings
 from sumo_cohesion.social.settings import CohesionSettings
@@ -136,30 +134,6 @@ def run_folder(folder: Path, planner: str, seed: int) -> Path:
     return folder / planner.replace(":", ".") / f"seed_{seed:04d}"
 
 
-def load_metrics(folder: str | Path) -> pd.DataFrame:
-    """Metrics rows of a run's folder, or of all runs below a folder.
-
-    Raises
-    ------
-    UserError
-        If there are none.
-    """
-    root = Path(folder)
-    if (root / "metrics.parquet").is_file():
-        return _read(root / "metrics.parquet")
-    parts = sorted(p.parent / "metrics.parquet" for p in root.rglob(RUN_FILE))
-    if not parts:
-        raise UserError(f"{root}: no runs there; give a folder written by run or compare --out")
-    return pd.concat([_read(p) for p in parts], ignore_index=True)
-
-
-def _read(path: Path) -> pd.DataFrame:
-    try:
-        return pd.read_parquet(path)
-    except (OSError, ValueError) as error:
-        raise UserError(f"{path}: not a readable table ({error}); run it again") from None
-
-
 def _keep(new: Path, folder: Path) -> Path | None:
     """Move the finished runs of a comparison that broke off beside its folder."""
     if not any(new.rglob(RUN_FILE)):
@@ -192,37 +166,19 @@ def _run_all(jobs: Sequence[_Job], workers: int | None, progress: Progress | Non
     return [done[i] for i in range(len(jobs))]
 
 
-def _results(jobs: Sequence[_Job], workers: int) -> Iterator[tuple[int, _Result]]:
-    # The workers' linear algebra must not start threads of its own: they would fight for cores.
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    os.environ.setdefault("OMP_NUM_THREADS", "1")
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(workers, context, initializer=_end_with_parent) as pool:
-        waiting = {pool.submit(_run_job, job): i for i, job in enumerate(jobs)}
-        try:
-            while waiting:
-                finished, _ = wait(waiting, return_when=FIRST_COMPLETED)
-                for future in finished:
-                    yield waiting.pop(future), future.result()
-        except BrokenProcessPool:
-            raise SimulationError(
-                "a worker process died (killed, out of memory, or SUMO crashed); "
-                "run the seeds one by one to find which"
-            ) from None
-        finally:
-            pool.shutdown(wait=False, cancel_futures=True)
-
-
-def _end_with_parent() -> None:
-    """Let a worker end when its parent is killed; it would wait for work for ever."""
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-
-        def watch() -> None:
-            parent.join()
-            os._exit(1)
-
-        threading.Thread(target=watch, daemon=True).start()
+def _results(jobs: Sequence[_Job], count: int) -> Iterator[tuple[int, _Result]]:
+    workers = Workers(f"{__name__}:_run_job", NO_LIMITS)
+    executor = ThreadPoolExecutor(count)
+    try:
+        waiting = {executor.submit(workers.call, job): i for i, job in enumerate(jobs)}
+        while waiting:
+            for future in wait(waiting, return_when=FIRST_COMPLETED).done:
+                yield waiting.pop(future), future.result()
+    except CallFailedError as error:
+        raise SimulationError(error.reason) from None
+    finally:
+        workers.close()  # first, so that no thread waits for a run
+        executor.shutdown(cancel_futures=True)
 
 
 def _run_job(job: _Job) -> _Result:

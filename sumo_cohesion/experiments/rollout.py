@@ -6,7 +6,8 @@ import json
 import platform
 import shutil
 import tempfile
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -39,6 +40,7 @@ class Rollout:
     info : scenario, planner, settings, seed, versions and outcome, ready for JSON.
     trajectory, plan, agreement, timing, reference, metrics : tables; see docs/tables.md for
         their columns.
+    sumo : SUMO's own outputs that were asked for, by kind (traffic.outputs).
     """
 
     info: dict[str, Any]
@@ -48,6 +50,7 @@ class Rollout:
     timing: pd.DataFrame
     reference: pd.DataFrame
     metrics: pd.DataFrame
+    sumo: Mapping[str, pd.DataFrame] = field(default_factory=dict)
 
     def write(self, folder: Path) -> Path:
         """Write run.json and one parquet file per table, all of them or none."""
@@ -55,6 +58,8 @@ class Rollout:
         with whole_folder(folder) as new:
             for name in TABLES:
                 getattr(self, name).to_parquet(new / f"{name}.parquet", index=False)
+            for name, table in self.sumo.items():
+                table.to_parquet(new / f"sumo_{name}.parquet", index=False)
             text = json.dumps(self.info, indent=2, ensure_ascii=False)
             (new / RUN_FILE).write_text(text + "\n", encoding="utf-8")
         return folder
@@ -65,9 +70,11 @@ class Rollout:
         try:
             info = json.loads((folder / RUN_FILE).read_text(encoding="utf-8"))
             tables = {name: pd.read_parquet(folder / f"{name}.parquet") for name in TABLES}
+            found = sorted(folder.glob("sumo_*.parquet"))
+            sumo = {path.stem.removeprefix("sumo_"): pd.read_parquet(path) for path in found}
         except (OSError, ValueError) as error:
             raise UserError(f"{folder}: not a complete run ({error}); run it again") from None
-        return Rollout(info=info, **tables)
+        return Rollout(info=info, sumo=sumo, **tables)
 
 
 def require_replaceable(folder: Path, marker: str) -> None:

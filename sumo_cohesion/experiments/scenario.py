@@ -212,6 +212,25 @@ def parse_override(text: str) -> tuple[str, Any]:
     return name.strip(), parsed
 
 
+def parse_seeds(text: str, what: str = "--seeds") -> list[int]:
+    """Parse "0:20" (half-open) or "3,7,9".
+
+    >>> parse_seeds("0:3"), parse_seeds("3,7,9")
+    ([0, 1, 2], [3, 7, 9])
+    """
+    try:
+        if ":" in text:
+            low, high = (int(part) for part in text.split(":"))
+            seeds = list(range(low, high))
+        else:
+            seeds = [int(part) for part in text.split(",")]
+    except ValueError:
+        raise UserError(f"{what} {text!r}: write 0:20 for 0 to 19, or a list 3,7,9") from None
+    if not seeds:
+        raise UserError(f"{what} {text!r} is empty; 0:20 means 0 to 19, the end is not included")
+    return seeds
+
+
 def validated(model: type[Model], data: object, where: str) -> Model:
     """Validate data; turn pydantic's report into one line."""
     try:

@@ -20,23 +20,34 @@ from sumo_cohesion.traffic.demand import (
     write_demand,
 )
 from sumo_cohesion.traffic.network import Network
+from sumo_cohesion.traffic.outputs import SumoOutputs
 from sumo_cohesion.traffic.simulator import SumoRun
 
 
 @dataclass(frozen=True)
-class Setup:
-    """One run, checked and ready: everything that decides its result."""
+class Inputs:
+    """What a run is made of, but for its seed: settings as they are used, files as they lie."""
 
     scenario: Scenario
     planner_name: str
     settings: PlannerSettings
     cohesion: CohesionSettings
-    seed: int
     network: Path
     routes: tuple[Path, ...]
     additional: tuple[Path, ...]
+
+
+@dataclass(frozen=True)
+class Setup(Inputs):
+    """One run, checked and ready: everything that decides its result.
+
+    ``outputs`` only adds to what is written.
+    """
+
+    seed: int
     route: tuple[str, ...]
     road: Road
+    outputs: SumoOutputs | None = None
 
     @property
     def not_human(self) -> set[str]:
@@ -62,7 +73,23 @@ class Setup:
             seed=self.seed,
             lateral_resolution=scenario.lateral_resolution,
             gui=gui,
+            outputs=self.outputs,
         )
+
+
+def resolve(scenario: str | Path, planner: str, overrides: Mapping[str, Any]) -> Inputs:
+    """Load and validate the settings and find the files, quickly: nothing is opened yet."""
+    settings, cohesion, scenario_overrides = settings_from(overrides)
+    loaded = load_scenario(scenario, scenario_overrides)
+    return Inputs(
+        scenario=loaded,
+        planner_name=planner,
+        settings=settings,
+        cohesion=cohesion_of(planner, cohesion),
+        network=loaded.file(loaded.network, "networks"),
+        routes=tuple(loaded.file(name, "routes") for name in loaded.routes),
+        additional=tuple(loaded.file(name, "routes") for name in loaded.additional),
+    )
 
 
 def prepare(
@@ -80,27 +107,13 @@ def prepare(
     """
     if not 0 <= seed < 2**31:
         raise UserError(f"seed {seed} is out of range; SUMO takes 0 to 2147483647")
-    settings, cohesion, scenario_overrides = settings_from(overrides or {})
-    loaded = load_scenario(scenario, scenario_overrides)
-    make_planner(planner, settings, cohesion)
-    network_file = loaded.file(loaded.network, "networks")
-    routes = tuple(loaded.file(name, "routes") for name in loaded.routes)
-    additional = tuple(loaded.file(name, "routes") for name in loaded.additional)
-    network = Network(network_file)
+    inputs = resolve(scenario, planner, overrides or {})
+    loaded = inputs.scenario
+    make_planner(planner, inputs.settings, inputs.cohesion)
+    network = Network(inputs.network)
     named = {*loaded.sensing.hidden, *loaded.sensing.special}
     for event in loaded.events:
         named |= {*event.who} | ({event.near} if event.near else set())
     check_human_type(loaded.human_type)
-    route = check_demand(network, routes, loaded.ego, named)
-    return Setup(
-        scenario=loaded,
-        planner_name=planner,
-        settings=settings,
-        cohesion=cohesion_of(planner, cohesion),
-        seed=seed,
-        network=network_file,
-        routes=routes,
-        additional=additional,
-        route=tuple(route),
-        road=network.road(route),
-    )
+    route = check_demand(network, inputs.routes, loaded.ego, named)
+    return Setup(**vars(inputs), seed=seed, route=tuple(route), road=network.road(route))

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -27,6 +28,7 @@ from sumo_cohesion.social.memory import new_history
 from sumo_cohesion.state import CartesianState, Observation, Plan, Scene
 from sumo_cohesion.traffic.contact import contacts
 from sumo_cohesion.traffic.drivers import Drivers
+from sumo_cohesion.traffic.outputs import Output, SumoOutputs
 from sumo_cohesion.traffic.simulator import STEP_LENGTH, Simulator
 
 END_OF_ROUTE = 20.0
@@ -40,6 +42,7 @@ def run(
     *,
     overrides: Mapping[str, Any] | None = None,
     out: str | Path | None = None,
+    sumo_outputs: Sequence[Output] = (),
     gui: bool = False,
 ) -> Rollout:
     """Drive one scenario once.
@@ -51,6 +54,7 @@ def run(
     seed : varies the traffic; the same seed gives every planner the same traffic.
     overrides : settings by dotted name, e.g. {"cohesion.beta": 0.05}.
     out : folder to write the run's tables to; nothing is written without it.
+    sumo_outputs : SUMO's own outputs to add as tables: "fcd", "tripinfo", "ssm".
     gui : show SUMO's window.
 
     Returns
@@ -67,10 +71,23 @@ def run(
     if out is not None:
         require_replaceable(Path(out), RUN_FILE)  # before the drive, not after
     setup = prepare(scenario, planner, seed, overrides)
-    rollout = simulate(setup, make_planner(planner, setup.settings, setup.cohesion), gui=gui)
+    driver = make_planner(planner, setup.settings, setup.cohesion)
+    rollout = simulate_with_outputs(setup, driver, sumo_outputs, gui=gui)
     if out is not None:
         rollout.write(Path(out))
     return rollout
+
+
+def simulate_with_outputs(
+    setup: Setup, planner: Planner, sumo_outputs: Sequence[Output], *, gui: bool = False
+) -> Rollout:
+    """Run the loop and add SUMO's own outputs to its tables."""
+    if not sumo_outputs:
+        return simulate(setup, planner, gui=gui)
+    with tempfile.TemporaryDirectory() as folder:
+        outputs = SumoOutputs(tuple(sumo_outputs), Path(folder))
+        rollout = simulate(replace(setup, outputs=outputs), planner, gui=gui)
+        return replace(rollout, sumo=outputs.read())
 
 
 def simulate(setup: Setup, planner: Planner, *, gui: bool = False) -> Rollout:
@@ -120,6 +137,8 @@ def _plan(planner: Planner, observation: Observation, history: History, setup: S
         plan = planner.plan(observation, history)
         usable = all(math.isfinite(v) for control in plan.controls[:1] for v in control)
         status = "control is not finite"
+    except MemoryError:
+        raise  # a car cannot drive on without memory; the run ends
     except Exception as error:
         usable, status = False, f"{type(error).__name__}: {error}"
     return plan if usable else fallback(observation, setup.road, setup.settings, status)

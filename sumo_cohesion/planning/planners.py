@@ -248,6 +248,9 @@ BUILT_IN = {
     "sumo": "SUMO's own driver model",
 }
 
+WITHOUT_COHESION = ("nominal", "sumo")
+"""Built-in planners whose runs are the same whatever the cohesion settings say."""
+
 
 def cohesion_of(name: str, cohesion: CohesionSettings) -> CohesionSettings:
     """Return the cohesion settings that the planner of this name really uses."""

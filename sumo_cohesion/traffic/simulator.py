@@ -19,6 +19,7 @@ from sumo_cohesion.errors import SimulationError, UserError
 from sumo_cohesion.state import CartesianState, Scene
 from sumo_cohesion.traffic.demand import EGO
 from sumo_cohesion.traffic.library import captured_stderr, first_error, load_libsumo, load_window
+from sumo_cohesion.traffic.outputs import SumoOutputs
 
 STEP_LENGTH = 0.1
 """Seconds per step, of SUMO and of every planner."""
@@ -41,6 +42,7 @@ class SumoRun:
     seed: int
     lateral_resolution: float
     gui: bool = False
+    outputs: SumoOutputs | None = None
 
     def options(self) -> list[str]:
         """SUMO's command line, without the program.
@@ -65,6 +67,8 @@ class SumoRun:
         }
         if self.additional:
             pairs["additional-files"] = ",".join(map(str, self.additional))
+        if self.outputs is not None:
+            pairs |= self.outputs.options()
         options = [text for key, value in pairs.items() for text in (f"--{key}", str(value))]
         return [*options, "--start", "--quit-on-end"] if self.gui else options
 

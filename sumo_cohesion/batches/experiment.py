@@ -1,0 +1,223 @@
+"""An experiment is data: scenarios x planners x grid x seeds, in a TOML file."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import tomllib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import pandas as pd
+from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, field_validator
+
+from sumo_cohesion.batches.identity import point_digest, run_key
+from sumo_cohesion.errors import UserError
+from sumo_cohesion.experiments.scenario import parse_seeds, validated
+from sumo_cohesion.experiments.setup import resolve
+from sumo_cohesion.planning.planners import make_planner
+from sumo_cohesion.traffic.outputs import Output
+
+Kept = Literal["ego", "trajectory", "plan", "agreement", "timing", "reference"]
+"""Tables that can be kept per run; ``ego`` is the ego's part of the trajectory."""
+Value = bool | int | float | str | list[Any]
+
+
+class RunLimits(BaseModel):
+    """What one run may take.
+
+    ``run_time`` (s of wall time), ``memory`` (GB; Linux only) and how often a run that crashed,
+    hung or ran out of memory is tried again (``retries``).
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    run_time: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 600.0
+    memory: Annotated[float, Field(ge=1, allow_inf_nan=False)] = 4.0
+    retries: Annotated[int, Field(ge=0, le=10)] = 0
+
+
+class Experiment(BaseModel):
+    """What to run and what to keep.
+
+    Attributes
+    ----------
+    scenarios : bundled names, or TOML files looked up beside the experiment's file.
+    planners : built-in names, or ``module:Class``.
+    seeds : "0:20" (half-open), or a list.
+    keep : tables to keep of every run, besides its metrics.
+    sumo_outputs : SUMO's own outputs to keep of every run.
+    set : settings by dotted name, the same in all runs.
+    grid : lists of values by dotted name; every combination is run.
+    limits : see RunLimits.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    name: str = "experiment"
+    summary: str = ""
+    scenarios: Annotated[tuple[str, ...], Field(min_length=1)]
+    planners: Annotated[tuple[str, ...], Field(min_length=1)] = ("nominal", "cohesive")
+    seeds: tuple[int, ...]
+    keep: tuple[Kept, ...] = ()
+    sumo_outputs: tuple[Output, ...] = ()
+    set: dict[str, Any] = {}
+    grid: dict[str, Annotated[list[Value], Field(min_length=1)]] = {}
+    limits: RunLimits = RunLimits()
+    _folder: Path = PrivateAttr(default=Path())
+
+    @field_validator("set", "grid", mode="before")
+    @classmethod
+    def _by_dotted_name(cls, value: Any) -> Any:
+        return flatten(value) if isinstance(value, Mapping) else value
+
+    @field_validator("seeds", mode="before")
+    @classmethod
+    def _as_list(cls, value: Any) -> Any:
+        if isinstance(value, str):
+            return parse_seeds(value, "seeds")
+        return value
+
+    @field_validator("scenarios", "planners", "seeds", "keep", "sumo_outputs")
+    @classmethod
+    def _no_repeats(cls, value: tuple[Any, ...]) -> tuple[Any, ...]:
+        _refuse_repeats(value)
+        return value
+
+    @field_validator("grid")
+    @classmethod
+    def _no_repeated_values(cls, value: dict[str, list[Value]]) -> dict[str, list[Value]]:
+        for values in value.values():
+            _refuse_repeats([json.dumps(v) for v in values])
+        return value
+
+    def points(self) -> Iterator[Point]:
+        """Every scenario, planner and grid point, in the order of the file."""
+        both = set(self.set) & set(self.grid)
+        if both:
+            raise UserError(f"{min(both)} is both in [set] and in [grid]; take one of them out")
+        for scenario, planner in itertools.product(self.scenarios, self.planners):
+            for values in itertools.product(*self.grid.values()):
+                yield Point(
+                    scenario=self._scenario_path(scenario),
+                    planner=planner,
+                    grid=dict(zip(self.grid, values, strict=True)),
+                    fixed=self.set,
+                )
+
+    def _scenario_path(self, scenario: str) -> str:
+        return str(self._folder / scenario) if scenario.endswith(".toml") else scenario
+
+
+def _refuse_repeats(values: Sequence[Any]) -> None:
+    for value in values:
+        if list(values).count(value) > 1:
+            raise ValueError(f"{value} is listed twice")
+
+
+@dataclass(frozen=True)
+class Point:
+    """One scenario, planner and combination of the grid's values: all runs but for the seed."""
+
+    scenario: str
+    planner: str
+    grid: Mapping[str, Value]
+    fixed: Mapping[str, Any]
+
+    @property
+    def overrides(self) -> dict[str, Any]:
+        """Settings by dotted name."""
+        return {**self.fixed, **self.grid}
+
+
+@dataclass(frozen=True)
+class Work:
+    """An experiment spelt out.
+
+    Attributes
+    ----------
+    plan : one row per wanted run: ``run`` (its key), scenario, planner, a column per grid name,
+        seed. Rows whose settings come to the same share a run: nominal has no beta.
+    points : the point that each distinct run belongs to.
+    """
+
+    plan: pd.DataFrame
+    points: Mapping[str, Point]
+
+
+def load_experiment(source: str | Path | Mapping[str, Any]) -> Experiment:
+    """Load and validate an experiment from a TOML file, or from a mapping of the same shape.
+
+    Raises
+    ------
+    UserError
+        If the file cannot be read or something in it is wrong.
+    """
+    if isinstance(source, Mapping):
+        return validated(Experiment, dict(source), "experiment")
+    path = Path(source)
+    try:
+        data = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read ({error.strerror})") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise UserError(f"{path}: not valid TOML: {error}") from None
+    experiment = validated(Experiment, data, str(path))
+    experiment._folder = path.parent.resolve()
+    return experiment
+
+
+def spell_out(experiment: Experiment) -> Work:
+    """List every run that an experiment wants, by the key of what decides its result.
+
+    Raises
+    ------
+    UserError
+        If a scenario, planner or setting is wrong; all points are looked at.
+    """
+    blocks: list[dict[str, Any]] = []
+    points: dict[str, Point] = {}
+    sources: dict[str, str] = {}
+    for point in experiment.points():
+        inputs = resolve(point.scenario, point.planner, point.overrides)
+        make_planner(point.planner, inputs.settings, inputs.cohesion)
+        name = inputs.scenario.name
+        if sources.setdefault(name, point.scenario) != point.scenario:
+            raise UserError(
+                f"{point.scenario}: its name {name!r} is also that of {sources[name]}; "
+                "tables tell scenarios apart by name, rename one"
+            )
+        digest = point_digest(inputs)
+        keys = [run_key(digest, seed) for seed in experiment.seeds]
+        points |= dict.fromkeys(keys, point)
+        columns = {key: as_cell(value) for key, value in point.grid.items()}
+        head = {"scenario": name, "planner": point.planner, **columns}
+        blocks.append({"run": keys, **head, "seed": list(experiment.seeds)})
+    plan = pd.concat([pd.DataFrame(block) for block in blocks], ignore_index=True)
+    for text in ("run", "scenario", "planner"):
+        plan[text] = plan[text].astype("string")
+    return Work(plan, points)
+
+
+def as_cell(value: Value) -> bool | int | float | str:
+    """Return a grid value as a table holds it: lists as text.
+
+    >>> as_cell([2, 5]), as_cell(0.5)
+    ('[2, 5]', 0.5)
+    """
+    return json.dumps(value) if isinstance(value, list) else value
+
+
+def flatten(data: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested tables as dotted names, however they were written.
+
+    >>> flatten({"cohesion": {"beta": [0.1]}, "ego.speed": [20]})
+    {'cohesion.beta': [0.1], 'ego.speed': [20]}
+    """
+    flat: dict[str, Any] = {}
+    for key, value in data.items():
+        name = f"{prefix}{key}"
+        flat |= flatten(value, f"{name}.") if isinstance(value, Mapping) else {name: value}
+    return flat

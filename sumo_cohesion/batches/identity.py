@@ -1,0 +1,84 @@
+"""Which run is which: a digest of everything that decides its result."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+import json
+import sys
+from functools import lru_cache
+from pathlib import Path
+
+import sumo_cohesion
+from sumo_cohesion.experiments.rollout import versions
+from sumo_cohesion.experiments.setup import Inputs
+from sumo_cohesion.planning.planners import WITHOUT_COHESION
+
+_ROOMS = ("traffic", "perception", "social", "planning", "experiments")
+"""The package's rooms whose code decides results, beside the shared modules."""
+
+
+def point_digest(inputs: Inputs) -> str:
+    """Digest of all that decides a run but its seed.
+
+    The scenario and the settings as they are used, the content of its network and demand, the
+    planner's code, this package's code, and the versions of SUMO and the other libraries. What
+    merely says what to keep is left out.
+    """
+    planner = inputs.planner_name
+    cohesion = inputs.cohesion.model_dump(mode="json")
+    about = {
+        "scenario": inputs.scenario.model_dump(mode="json", exclude={"summary"}),
+        "files": [
+            file_digest(path) for path in (inputs.network, *inputs.routes, *inputs.additional)
+        ],
+        "planner": [planner, planner_digest(planner)],
+        "settings": inputs.settings.model_dump(mode="json"),
+        "cohesion": None if planner in WITHOUT_COHESION else cohesion,
+        "code": code_digest(),
+    }
+    return _digest(json.dumps(about, sort_keys=True).encode())
+
+
+def run_key(point: str, seed: int) -> str:
+    """Key of one run: 16 hexadecimal digits."""
+    return _digest(f"{point} {seed}".encode())[:16]
+
+
+@lru_cache(maxsize=1)
+def code_digest() -> str:
+    """Digest of the code that decides results, and of the versions it stands on."""
+    package = Path(sumo_cohesion.__file__).parent
+    paths = [*package.glob("*.py"), *(p for room in _ROOMS for p in (package / room).glob("*.py"))]
+    digest = hashlib.sha256()
+    for path in sorted(p for p in paths if p.stem not in ("cli", "__main__")):
+        digest.update(path.relative_to(package).as_posix().encode() + b"\0" + path.read_bytes())
+    digest.update(json.dumps(versions(), sort_keys=True).encode())
+    return digest.hexdigest()
+
+
+def file_digest(path: Path) -> str:
+    """Digest of a file's content; read again only if the file has changed."""
+    stat = path.stat()
+    return _file_digest(path, stat.st_mtime_ns, stat.st_size)
+
+
+@lru_cache(maxsize=256)
+def _file_digest(path: Path, _changed: int, _size: int) -> str:
+    return _digest(path.read_bytes())
+
+
+def planner_digest(name: str) -> str:
+    """Digest of the module of a user's own planner; empty for the built-in ones."""
+    module, _, class_name = name.partition(":")
+    if not class_name:
+        return ""
+    loaded = sys.modules.get(module)
+    spec = loaded.__spec__ if loaded is not None else importlib.util.find_spec(module)
+    if spec is None or spec.origin is None or not Path(spec.origin).is_file():
+        return ""
+    return file_digest(Path(spec.origin))
+
+
+def _digest(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()

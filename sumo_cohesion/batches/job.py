@@ -1,0 +1,102 @@
+"""One run of a batch, as a worker process does it."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from pathlib import Path
+from time import perf_counter
+from typing import Any, NamedTuple
+
+import pandas as pd
+
+from sumo_cohesion.batches.identity import point_digest, run_key
+from sumo_cohesion.errors import StorageError, UserError
+from sumo_cohesion.experiments.rollout import Rollout
+from sumo_cohesion.experiments.setup import prepare
+from sumo_cohesion.experiments.simulation import simulate_with_outputs
+from sumo_cohesion.planning.planners import Planner, make_planner
+from sumo_cohesion.planning.settings import PlannerSettings
+from sumo_cohesion.social.settings import CohesionSettings
+from sumo_cohesion.traffic.demand import EGO
+from sumo_cohesion.traffic.outputs import Output
+
+TASK = f"{__name__}:drive"
+"""What workers are asked to do."""
+SUMO = "sumo_"
+"""Before the name of a table that SUMO wrote."""
+
+
+class Job(NamedTuple):
+    """One run: its key, what to run, and what to keep where."""
+
+    run: str
+    scenario: str
+    planner: str
+    seed: int
+    overrides: dict[str, Any]
+    tables: tuple[str, ...]
+    folder: str
+
+
+def drive(job: Job) -> dict[str, Any]:
+    """Do one run; keep its tables; return its metrics and what it took.
+
+    Raises
+    ------
+    UserError, SimulationError
+        As run() does; also if anything that decides the result has changed since the batch
+        was started, or is different on this machine.
+    """
+    start = perf_counter()
+    setup = prepare(job.scenario, job.planner, job.seed, job.overrides)
+    if run_key(point_digest(setup), job.seed) != job.run:
+        raise UserError(
+            "scenario, network, planner, code or versions are not those the batch was started "
+            "with; start it again, with the same versions on every machine"
+        )
+    outputs: list[Output] = [
+        kind for kind in ("fcd", "tripinfo", "ssm") if SUMO + kind in job.tables
+    ]
+    planner = _planner(job.planner, setup.settings, setup.cohesion)
+    rollout = simulate_with_outputs(setup, planner, outputs)
+    for name in job.tables:
+        _keep(rollout, name, table_file(Path(job.folder), name, job.run))
+    (row,) = rollout.metrics.to_dict(orient="records")
+    failed = rollout.plan[rollout.plan["fallback"]]
+    reason = ""
+    if len(failed):
+        first = failed["status"].iloc[0]
+        reason = f"no plan in {len(failed)} of {len(rollout.plan)} steps, first: {first}"
+    metrics = {str(name): value for name, value in row.items()}
+    return {"reason": reason, "wall_time": perf_counter() - start, **metrics}
+
+
+def table_file(folder: Path, name: str, run: str) -> Path:
+    """File of one kept table of one run."""
+    return folder / "tables" / name / f"{run}.parquet"
+
+
+def _keep(rollout: Rollout, name: str, path: Path) -> None:
+    if name.startswith(SUMO):
+        table = rollout.sumo[name.removeprefix(SUMO)]
+    elif name == "ego":
+        table = rollout.trajectory
+        table = table[table["vehicle"] == EGO].drop(columns=["vehicle", "visible"])
+    else:
+        table = getattr(rollout, name)
+    table = pd.concat([pd.Series(path.stem, table.index, "category", name="run"), table], axis=1)
+    new = path.with_name(f".{path.name}.new")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        table.to_parquet(new, index=False)
+        new.replace(path)
+    except OSError as error:
+        raise StorageError(
+            f"{path.parent}: cannot be written ({error.strerror or error})"
+        ) from None
+
+
+@lru_cache(maxsize=8)
+def _planner(name: str, settings: PlannerSettings, cohesion: CohesionSettings) -> Planner:
+    """One planner per process, so that its solver is built once for all seeds."""
+    return make_planner(name, settings, cohesion)

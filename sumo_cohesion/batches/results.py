@@ -1,0 +1,110 @@
+"""Read results: of one run, of a comparison or of a batch, whichever wrote the folder."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from sumo_cohesion.batches.experiment import as_cell
+from sumo_cohesion.batches.job import table_file
+from sumo_cohesion.batches.store import is_batch, joined, read_parquet, wanted
+from sumo_cohesion.errors import UserError
+from sumo_cohesion.experiments.rollout import RUN_FILE
+
+
+def load_metrics(folder: str | Path) -> pd.DataFrame:
+    """Metrics of a run, a comparison or a batch, or of all runs below a folder.
+
+    Of a batch: one row per wanted run that was done or has failed, with its ``status`` and the
+    grid's values; its bool and int columns can be missing (pandas "boolean" and "Int64").
+
+    Raises
+    ------
+    UserError
+        If there are none, or they cannot be read.
+    """
+    root = Path(folder)
+    if is_batch(root):
+        return joined(root)
+    if (root / "metrics.parquet").is_file():
+        return read_parquet(root / "metrics.parquet")
+    parts = [run / "metrics.parquet" for run in _run_folders(root)]
+    return pd.concat([read_parquet(part) for part in parts], ignore_index=True)
+
+
+def load_trajectories(
+    folder: str | Path,
+    where: Mapping[str, Any] | None = None,
+    *,
+    table: str = "trajectory",
+) -> pd.DataFrame:
+    """Trajectories, or another table, of many runs; only files of wanted runs are opened.
+
+    Parameters
+    ----------
+    folder : of a batch that kept the table, a comparison or a run.
+    where : which runs, by ``scenario``, ``planner``, ``seed`` or a grid's name: a value or a
+        list of values, e.g. {"planner": "cohesive", "cohesion.beta": [0.03, 0.09]}.
+    table : "trajectory", "ego", "plan", "agreement", "timing", "reference", "sumo_fcd",
+        "sumo_tripinfo" or "sumo_ssm".
+
+    Returns
+    -------
+    The table, with the columns that tell the runs apart before its own (docs/tables.md).
+
+    Raises
+    ------
+    UserError
+        If no run fits, or the table was not kept.
+    """
+    root = Path(folder)
+    plan = wanted(root) if is_batch(root) else _runs_below(root)
+    for name, value in (where or {}).items():
+        if name not in plan.columns:
+            known = ", ".join(c for c in plan.columns if c not in ("run", "path"))
+            raise UserError(f"runs are not told apart by {name!r}; choose from {known}")
+        values = value if isinstance(value, list | tuple | set | range) else [value]
+        cells = [as_cell(v) if isinstance(v, list) else v for v in values]
+        plan = plan[plan[name].isin(cells)]
+    frames = []
+    for row in plan.to_dict(orient="records"):
+        told = {str(name): value for name, value in row.items() if name != "path"}
+        path = (
+            table_file(root, table, told["run"])
+            if "run" in told
+            else row["path"] / f"{table}.parquet"
+        )
+        if path.is_file():
+            frame = read_parquet(path).drop(columns="run", errors="ignore")
+            frames.append(frame.assign(**told)[[*told, *frame.columns]])
+    if not frames:
+        raise UserError(
+            f"{root}: no run there fits, or the table {table!r} was not kept; "
+            "an experiment keeps it with keep = [...] or sumo_outputs = [...]"
+        )
+    return pd.concat(frames, ignore_index=True)
+
+
+def _run_folders(root: Path) -> list[Path]:
+    found = sorted(path.parent for path in root.rglob(RUN_FILE))
+    if not found:
+        raise UserError(
+            f"{root}: no runs there; give a folder written by run, compare or batch --out"
+        )
+    return found
+
+
+def _runs_below(root: Path) -> pd.DataFrame:
+    rows = []
+    for folder in _run_folders(root):
+        try:
+            info = json.loads((folder / RUN_FILE).read_text(encoding="utf-8"))
+        except (OSError, ValueError) as error:
+            raise UserError(f"{folder}: not a complete run ({error}); run it again") from None
+        names = {"scenario": info["scenario"]["name"], "planner": info["planner"]}
+        rows.append({**names, "seed": info["seed"], "path": folder})
+    return pd.DataFrame(rows)
