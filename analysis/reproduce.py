@@ -4,36 +4,35 @@
 
 Writes into analysis/: claims.csv (each claim's rate with its 95 % Wilson interval), outcomes.csv
 (what happened per case and planner), runs.parquet (all metrics of all runs) and reproduce.json
-(command, seeds, versions). Finished parts are kept in results/reproduce; run it again after a stop
-and it goes on from there. What was measured with other code or scenarios is not taken up.
+(command, seeds, versions). Each case is a batch in results/reproduce: run it again after a stop and
+it goes on from there. What was measured with other code or scenarios is not taken up.
 """
 
 from __future__ import annotations
 
 import argparse
-import hashlib
 import json
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 
-import sumo_cohesion
-from sumo_cohesion import compare
+from sumo_cohesion.batches.batch import Progress, batch
+from sumo_cohesion.batches.results import with_nominal_deviation
 from sumo_cohesion.errors import SimulationError, UserError
+from sumo_cohesion.experiments.columns import METRICS, as_table
 from sumo_cohesion.experiments.rollout import versions
-from sumo_cohesion.experiments.scenario import bundled, parse_seeds
+from sumo_cohesion.experiments.scenario import parse_seeds
 from sumo_cohesion.experiments.statistics import wilson
 
 HERE = Path(__file__).resolve().parent
 PLANNERS = ("nominal", "cohesive", "paper", "sumo")
 OURS = PLANNERS[:3]
-PART = 10
-"""Seeds that are run and kept together."""
 
 Case = tuple[str, Mapping[str, Any]]
 CASES: dict[str, Case] = {
@@ -236,28 +235,6 @@ def outcomes(case: str, runs: pd.DataFrame) -> list[dict[str, object]]:
     return rows
 
 
-def fingerprint() -> str:
-    """Digest of what decides results: the package's rooms, the bundled data, the versions."""
-    package = Path(sumo_cohesion.__file__).parent
-    named = {
-        str(p.relative_to(package)): p
-        for p in package.rglob("*.py")
-        if p.parent.name != "report" and p.stem != "cli"
-    }
-    for kind in ("scenarios", "networks", "routes"):
-        named |= {f"{kind}/{p.name}": p for p in bundled(kind).iterdir() if p.is_file()}
-    digest = hashlib.sha1(usedforsecurity=False)
-    for name in sorted(named):
-        digest.update(name.encode() + b"\0" + named[name].read_bytes())
-    digest.update(json.dumps(versions(), sort_keys=True).encode())
-    return digest.hexdigest()[:12]
-
-
-def parts(seeds: Sequence[int]) -> list[Sequence[int]]:
-    """Cut the seeds into parts that are kept one by one."""
-    return [seeds[i : i + PART] for i in range(0, len(seeds), PART)]
-
-
 def run_cases(
     cases: Mapping[str, Case],
     planners: Sequence[str],
@@ -265,43 +242,48 @@ def run_cases(
     workers: int | None,
     work: Path,
 ) -> dict[str, pd.DataFrame]:
-    """Run what has not been run yet; say how far it is and how long it will take."""
-    folder = work / fingerprint()
-    folder.mkdir(parents=True, exist_ok=True)
-    jobs = {
-        (case, i): folder / _file_name(case, cases[case], planners, part)
-        for case in cases
-        for i, part in enumerate(parts(seeds))
-    }
-    todo = [job for job, path in jobs.items() if not path.is_file()]
-    if len(todo) < len(jobs):
-        print(f"{len(jobs) - len(todo)} of {len(jobs)} parts are there already", file=sys.stderr)
-    start = time.monotonic()
-    for done, (case, i) in enumerate(todo):
-        part = parts(seeds)[i]
-        left = f", about {_minutes(start, done, len(todo))} left" if done else ""
-        print(f"[{done + 1}/{len(todo)}] {case}, {len(part)} seeds{left}", file=sys.stderr)
-        scenario, overrides = cases[case]
-        runs = compare(scenario, planners, part, overrides=overrides, workers=workers).runs
-        path = jobs[case, i]
-        runs.to_parquet(path.with_suffix(".new"), index=False)
-        path.with_suffix(".new").replace(path)
-    tables = {
-        case: [pd.read_parquet(p) for (c, _), p in jobs.items() if c == case] for case in cases
-    }
-    return {case: pd.concat(own, ignore_index=True) for case, own in tables.items()}
+    """Run each case as a batch of its own; what is done already is not done again."""
+    tables = {}
+    for i, (case, (scenario, overrides)) in enumerate(cases.items()):
+        print(f"[{i + 1}/{len(cases)}] {case}", file=sys.stderr)
+        experiment = {
+            "scenarios": [scenario],
+            "planners": list(planners),
+            "seeds": list(seeds),
+            "set": dict(overrides),
+            "keep": ["ego"] if "nominal" in planners else [],
+        }
+        folder = work / case.replace(", ", "-").replace(" ", "_")
+        with told_every_minute(case) as progress:
+            runs = batch(experiment, folder, workers=workers, progress=progress)
+        failed = runs[runs["status"] != "done"]
+        if len(failed):
+            raise SimulationError(
+                f"{case}, seed {failed['seed'].iloc[0]}: {failed['reason'].iloc[0]}"
+            )
+        if "nominal" in planners:
+            runs = with_nominal_deviation(runs, folder)
+        tables[case] = as_table("metrics", {c.name: runs[c.name] for c in METRICS})
+    return tables
 
 
-def _file_name(name: str, case: Case, planners: Sequence[str], part: Sequence[int]) -> str:
-    """Name of a part's file: a readable beginning, and a digest of all that it stands for."""
-    about = json.dumps([*case, list(planners), list(part)], sort_keys=True)
-    digest = hashlib.sha1(about.encode(), usedforsecurity=False).hexdigest()[:8]
-    return f"{name.replace(', ', '-').replace(' ', '_')}-{part[0]}-{digest}.parquet"
+@contextmanager
+def told_every_minute(case: str) -> Iterator[Callable[[Progress], None]]:
+    """Print how far a batch is and how long it will take."""
+    start = told = time.monotonic()
 
+    def show(progress: Progress) -> None:
+        nonlocal told
+        now = time.monotonic()
+        if now - told > 60.0:
+            told = now
+            left = (now - start) / progress.done * (progress.total - progress.done)
+            print(
+                f"    {case}: {progress.done} of {progress.total}, about {left / 60:.0f} min left",
+                file=sys.stderr,
+            )
 
-def _minutes(start: float, done: int, todo: int) -> str:
-    seconds = (time.monotonic() - start) / done * (todo - done)
-    return f"{seconds / 60:.0f} min"
+    yield show
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

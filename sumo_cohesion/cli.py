@@ -6,6 +6,7 @@ import json
 import math
 import os
 import sys
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -22,6 +23,8 @@ if TYPE_CHECKING:
     import pandas as pd
 
 PLANNER_HELP = "nominal, cohesive, paper, sumo, or your own as module:Class."
+_QUIET = 60.0
+"""Seconds between two lines of progress where there is no terminal."""
 SET_HELP = "Change a setting, e.g. cohesion.beta=0.05, planner.horizon=10, ego.speed=20."
 
 
@@ -119,6 +122,98 @@ def compare(
     click.echo(f"runs and tables in {folder}, picture in {picture}", err=True)
 
 
+@app.command("batch")
+@click.argument("experiment", type=click.Path(path_type=Path))
+@click.option("--out", type=click.Path(path_type=Path), help="Default: results/EXPERIMENT.")
+@click.option("--workers", type=click.IntRange(min=1), help="Processes. Default: one per core.")
+@click.option("--dask", metavar="ADDRESS", help="Run on a Dask cluster; 'local' starts one here.")
+@click.option(
+    "--shard", metavar="I/N", default="1/1", help="Only the I-th of N parts (job arrays)."
+)
+@click.option("--retry-failed", is_flag=True, help="Also run again what has failed before.")
+@click.option(
+    "--dry-run", is_flag=True, help="Say how many runs there are, and how long they take."
+)
+@click.option("--json", "as_json", is_flag=True, help="Print the runs as JSON.")
+def run_batch(
+    experiment: Path,
+    out: Path | None,
+    workers: int | None,
+    dask: str | None,
+    shard: str,
+    retry_failed: bool,
+    dry_run: bool,
+    as_json: bool,
+) -> None:
+    """Do all runs of EXPERIMENT (a TOML file) that are not done yet.
+
+    Interrupt it when you like, and run it again to go on.
+    """
+    from sumo_cohesion.batches import batch as batches
+
+    folder = out if out is not None else Path("results") / experiment.stem
+    if dry_run:
+        with _clean_stdout():
+            plan = batches.dry_run(experiment, folder)
+        _print_plan(plan, folder, workers or os.cpu_count() or 1, as_json=as_json)
+        return
+    with _clean_stdout(), _progress(experiment.stem) as progress:
+        rows = batches.batch(
+            experiment,
+            folder,
+            workers=workers,
+            dask=dask,
+            shard=_parse_shard(shard),
+            retry_failed=retry_failed,
+            progress=lambda p: progress(p.done, p.total, p.failed),
+        )
+    failed = rows[rows["status"] != "done"].drop_duplicates("run")
+    for reason, runs in failed.groupby("reason", sort=False):
+        click.echo(f"note: {len(runs)} runs have failed: {reason}", err=True)
+    if as_json:
+        click.echo(json.dumps({"runs": _records(rows)}, ensure_ascii=False))
+    else:
+        _print_summary(_summary(rows))
+    click.echo(f"metrics in {folder / 'metrics.parquet'}", err=True)
+
+
+def _parse_shard(text: str) -> tuple[int, int]:
+    try:
+        index, count = (int(part) for part in text.split("/"))
+    except ValueError:
+        raise UserError(f"--shard {text!r}: write 1/4 to 4/4 for four parts") from None
+    return index, count
+
+
+def _summary(rows: pd.DataFrame) -> pd.DataFrame:
+    """Rates and means per scenario and planner, over the whole grid."""
+    from sumo_cohesion.experiments.statistics import summarize
+
+    done = rows[rows["status"] == "done"].drop_duplicates("run")
+    several = done["scenario"].nunique() > 1
+    names = done["scenario"] + ", " + done["planner"] if several else done["planner"]
+    return summarize(done.assign(planner=names))
+
+
+def _print_plan(plan: pd.DataFrame, folder: Path, workers: int, *, as_json: bool) -> None:
+    hours = plan["seconds"].sum() / workers / 3600
+    if as_json:
+        document = {"plan": _records(plan), "workers": workers, "hours": hours}
+        click.echo(json.dumps(document, ensure_ascii=False))
+        return
+    click.echo(plan.round({"seconds": 0}).to_string(index=False))
+    click.echo(
+        f"{plan['left'].sum()} of {plan['runs'].sum()} runs are left for {folder}: about "
+        f"{_duration(3600 * hours)} with {workers} workers"
+    )
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
+
+
 @app.command()
 @click.argument("folder", type=click.Path(path_type=Path))
 @click.option(
@@ -157,8 +252,29 @@ def metrics(folder: Path, style: str, out: Path | None) -> None:
 @click.argument("folder", type=click.Path(path_type=Path))
 @click.option("--out", type=click.Path(path_type=Path), help="Picture file, .png, .pdf or .svg.")
 @click.option("--seed", type=int, help="Which seed of a comparison. Default: the first.")
-def figure(folder: Path, out: Path | None, seed: int | None) -> None:
-    """Draw the picture of a run or a comparison from its saved tables."""
+@click.option("--metric", help="Of a batch: what to draw, e.g. success.")
+@click.option("--over", help="Of a batch: a name of its grid, the horizontal axis.")
+@click.option("--panels", help="Of a batch: another name of its grid, a panel per value.")
+def figure(
+    folder: Path,
+    out: Path | None,
+    seed: int | None,
+    metric: str | None,
+    over: str | None,
+    panels: str | None,
+) -> None:
+    """Draw the picture of a run, a comparison or a batch from its saved tables."""
+    from sumo_cohesion.batches.store import is_batch
+
+    if is_batch(folder):
+        if metric is None or over is None:
+            raise UserError(f"{folder}: is a batch; say what to draw with --metric and --over")
+        from sumo_cohesion.batches.results import load_metrics
+        from sumo_cohesion.report.grid import draw_grid
+
+        picture = out or folder / f"{metric}.png"
+        click.echo(draw_grid(load_metrics(folder), metric, over, panels, picture))
+        return
     from sumo_cohesion.report.paths import draw_comparison, draw_run
 
     draw = draw_comparison if (folder / "comparison.json").is_file() else draw_run
@@ -259,7 +375,18 @@ def _progress(title: str) -> Iterator[Any]:
     console = Console(stderr=True)
     with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
         task = bar.add_task(title, total=None)
-        yield lambda done, total: bar.update(task, completed=done, total=total)
+        told = time.monotonic()
+
+        def show(done: int, total: int, failed: int = 0) -> None:
+            nonlocal told
+            note = f"{title}, {failed} failed" if failed else title
+            bar.update(task, completed=done, total=total, description=note)
+            # Where there is no terminal, a line now and then: for the log of a night's batch.
+            if bar.disable and time.monotonic() - told > _QUIET:
+                told = time.monotonic()
+                click.echo(f"{note}: {done} of {total}", err=True)
+
+        yield show
 
 
 @contextmanager

@@ -13,7 +13,10 @@ from sumo_cohesion.batches.experiment import as_cell
 from sumo_cohesion.batches.job import table_file
 from sumo_cohesion.batches.store import is_batch, joined, read_parquet, wanted
 from sumo_cohesion.errors import UserError
+from sumo_cohesion.experiments.metrics import deviation
 from sumo_cohesion.experiments.rollout import RUN_FILE
+
+_OF_NOMINAL = ("nominal_lateral_deviation", "nominal_speed_deviation")
 
 
 def load_metrics(folder: str | Path) -> pd.DataFrame:
@@ -87,6 +90,24 @@ def load_trajectories(
             "an experiment keeps it with keep = [...] or sumo_outputs = [...]"
         )
     return pd.concat(frames, ignore_index=True)
+
+
+def with_nominal_deviation(metrics: pd.DataFrame, folder: str | Path) -> pd.DataFrame:
+    """Fill ``nominal_lateral_deviation`` and ``nominal_speed_deviation`` of a batch's metrics.
+
+    They compare two runs, so that no single one has them: each run with the nominal planner's
+    on the same seed, scenario and grid point. The batch must have run nominal and kept "ego".
+    """
+    paths = dict(tuple(load_trajectories(folder, table="ego").groupby("run", sort=False)))
+    same = [c for c in wanted(Path(folder)).columns if c not in ("run", "planner")]
+    nominal = metrics.loc[metrics["planner"] == "nominal", [*same, "run"]]
+    pairs = metrics[[*same, "run"]].merge(nominal, on=same, how="left", suffixes=("", "_nominal"))
+    filled = metrics.reset_index(drop=True)
+    for i, (run, other_run) in enumerate(zip(pairs["run"], pairs["run_nominal"], strict=True)):
+        own, other = paths.get(run), None if pd.isna(other_run) else paths.get(other_run)
+        if own is not None and other is not None:
+            filled.loc[i, list(_OF_NOMINAL)] = deviation(own, other)
+    return filled
 
 
 def _run_folders(root: Path) -> list[Path]:

@@ -1,0 +1,55 @@
+"""Users' planners that go wrong in every way there is, after ten steps of driving well."""
+
+from __future__ import annotations
+
+import ctypes
+import time
+
+import numpy as np
+
+from sumo_cohesion.perception.history import History
+from sumo_cohesion.road import Road
+from sumo_cohesion.state import Control, Observation, Plan
+
+
+class Good:
+    """Keeps its course."""
+
+    def reset(self, road: Road) -> None:
+        self.steps = 0
+
+    def plan(self, observation: Observation, history: History) -> Plan:
+        self.steps += 1
+        if self.steps > 10:
+            self.fail()
+        return Plan((Control(0.0, 0.5),), np.array([observation.ego]), "solved")
+
+    def fail(self) -> None:
+        """Do not fail."""
+
+
+class SegmentationFault(Good):
+    def fail(self) -> None:
+        ctypes.string_at(0)
+
+
+class Endless(Good):
+    def fail(self) -> None:
+        while True:
+            time.sleep(0.01)
+
+
+class EatsMemory(Good):
+    def fail(self) -> None:
+        self.eaten = getattr(self, "eaten", [])
+        self.eaten.append(np.ones(20_000_000))
+
+
+class Raises(Good):
+    def fail(self) -> None:
+        raise ValueError("no idea where to go")
+
+
+class RaisesAtOnce(Good):
+    def reset(self, road: Road) -> None:
+        raise ValueError("no such road")
