@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from sumo_cohesion.batches.batch import batch
+    from sumo_cohesion.batches.paired import compare_planners
     from sumo_cohesion.batches.results import load_metrics, load_trajectories
     from sumo_cohesion.errors import SimulationError, UserError
     from sumo_cohesion.experiments.comparison import Comparison, compare
@@ -25,6 +26,7 @@ _HOME = {
     "UserError": "errors",
     "batch": "batches.batch",
     "compare": "experiments.comparison",
+    "compare_planners": "batches.paired",
     "export_scenario": "experiments.export",
     "load_metrics": "batches.results",
     "load_scenario": "experiments.scenario",
@@ -39,6 +41,7 @@ __all__ = [
     "UserError",
     "batch",
     "compare",
+    "compare_planners",
     "export_scenario",
     "load_metrics",
     "load_scenario",

@@ -12,6 +12,7 @@ import pytest
 
 from analysis import markdown
 from sumo_cohesion import cli
+from sumo_cohesion.batches.experiment import Experiment, RunLimits, load_experiment, spell_out
 from sumo_cohesion.experiments.columns import describe_tables
 from sumo_cohesion.experiments.scenario import Scenario
 from tests.conftest import ROOT
@@ -35,6 +36,9 @@ def test_readme_commands_run(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "straight.py").write_text(blocks(README, "python")[1])
+    (experiment,) = blocks(README, "toml")
+    short = experiment.replace("[grid]", "[set]\nduration = 2.0\n[grid]").replace("0:20", "0:2")
+    (tmp_path / "humans.toml").write_text(short)
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     commands = [line for block in blocks(README, "sh") for line in block.splitlines() if line]
@@ -53,8 +57,8 @@ def test_readme_commands_run(
     assert "scenario,planner,seed,success" in capsys.readouterr().out
 
 
-def test_readme_links_exist() -> None:
-    for page in (ROOT / "README.md", ROOT / "CONTRIBUTING.md"):
+def test_links_exist() -> None:
+    for page in (ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").glob("*.md")):
         for target in re.findall(r"\]\((?!http)([^)#]+)\)", page.read_text(encoding="utf-8")):
             assert (page.parent / target).exists(), target
 
@@ -77,6 +81,40 @@ def test_scenario_page_shows_every_key_and_a_valid_file() -> None:
     bundled = tomllib.loads((ROOT / "scenarios" / "stalled.toml").read_text())
     shared = {k: v for k, v in data.items() if k in bundled and not isinstance(v, dict)}
     assert shared == {k: bundled[k] for k in shared}
+
+
+def test_batches_page_shows_every_key_and_its_code_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    page = (ROOT / "docs" / "batches.md").read_text(encoding="utf-8")
+    (example,) = blocks(page, "toml")
+    data = tomllib.loads(example)
+    experiment = load_experiment(data)
+    assert set(data) == set(Experiment.model_fields)
+    assert set(data["limits"]) == set(RunLimits.model_fields)
+    assert len(spell_out(experiment).plan) == 2 * 3 * 2 * 50
+    # The same experiment, on fewer and shorter runs.
+    monkeypatch.chdir(tmp_path)
+    short = example.replace('"0:50"', '"0:2"').replace("30.0", "3.0")
+    short = short.replace("[0.03, 0.09, 0.27]", "[0.03, 0.09]")
+    (tmp_path / "beta.toml").write_text(short)
+    commands = [line for block in blocks(page, "sh") for line in block.splitlines()]
+    assert len(commands) == 5
+    for command in commands:
+        monkeypatch.setattr(sys, "argv", shlex.split(command, comments=True))
+        cli.main()
+    said = capsys.readouterr().out
+    assert "12 of 12 runs are left" in said
+    assert (tmp_path / "beta.csv").read_text().startswith("run,status,reason")
+    assert (tmp_path / "beta" / "success.png").stat().st_size > 10_000
+    (code,) = blocks(page, "python")
+    exec(compile(code, "batches.md", "exec"), {"__name__": "batches"})
+    assert "p_adjusted" in capsys.readouterr().out
+
+
+def test_the_examples_are_valid() -> None:
+    for path in (ROOT / "docs" / "examples").glob("*.toml"):
+        assert len(spell_out(load_experiment(path)).plan) > 100
 
 
 def test_the_evidence_holds_the_tables_that_were_measured() -> None:

@@ -84,7 +84,7 @@ def _keep(rollout: Rollout, name: str, path: Path) -> None:
         table = table[table["vehicle"] == EGO].drop(columns=["vehicle", "visible"])
     else:
         table = getattr(rollout, name)
-    table = pd.concat([pd.Series(path.stem, table.index, "category", name="run"), table], axis=1)
+    table = table.assign(run=pd.Categorical([path.stem] * len(table), [path.stem]))
     new = path.with_name(f".{path.name}.new")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -26,24 +26,15 @@ import pandas as pd
 
 from sumo_cohesion.batches.job import table_file
 from sumo_cohesion.errors import StorageError, UserError
-from sumo_cohesion.experiments.columns import METRICS, Column
+from sumo_cohesion.experiments.columns import BATCH, METRICS
 
 MANIFEST = "manifest.json"
 FORMAT = 1
 ROWS_PER_PART = 1000
 DONE = "done"
 
-RUN_COLUMNS = (
-    Column("run", "string", "", "key: digest of everything that decides the run's result"),
-    Column("status", "string", "", "done, error, crash, timeout or memory"),
-    Column("reason", "string", "", "why there is no result, or why the planner failed; or empty"),
-    Column("attempts", "int64", "", "how often it was tried"),
-    Column("wall_time", "float64", "s", "of the last attempt; NaN if it gave no result"),
-)
-"""Columns before those of a run's metrics. In a run without result all metrics are missing."""
-
 _NULLABLE = {"bool": "boolean", "int64": "Int64"}
-_DTYPES = {c.name: c.dtype for c in RUN_COLUMNS} | {
+_DTYPES = {c.name: c.dtype for c in BATCH} | {
     c.name: _NULLABLE.get(c.dtype, c.dtype) for c in METRICS
 }
 NOT_REPEATABLE = ("attempts", "wall_time", "plan_ms_median", "plan_ms_p99")
@@ -168,12 +159,12 @@ def joined(folder: Path) -> pd.DataFrame:
     named = {"scenario", "planner", "seed"}
     rows = rows.drop(columns=[c for c in rows.columns if c in named])
     table = plan.merge(rows, on="run", how="inner", sort=False, validate="many_to_one")
-    first = [c.name for c in RUN_COLUMNS]
+    first = [c.name for c in BATCH]
     return table[[*first, *(c for c in table.columns if c not in first)]]
 
 
 def _stored(folder: Path, columns: list[str] | None) -> pd.DataFrame:
-    """All rows in runs/, each run once: the newest that has a result."""
+    """All rows in runs/, each run once: the newest."""
     paths = sorted((folder / "runs").iterdir()) if (folder / "runs").is_dir() else []
     sealed = {p.stem for p in paths if p.suffix == ".parquet"}
     frames = [
@@ -184,8 +175,6 @@ def _stored(folder: Path, columns: list[str] | None) -> pd.DataFrame:
     if not frames:
         frames = [_frame([], columns)]
     rows = pd.concat(frames, ignore_index=True)
-    # Failed first, so that the last one of a key is its result where there is one.
-    rows = rows.sort_values("status", key=lambda s: s == DONE, kind="stable")
     return rows.drop_duplicates("run", keep="last")
 
 

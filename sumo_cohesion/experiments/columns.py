@@ -153,6 +153,15 @@ METRICS = (
     Column("plan_ms_p99", "float64", "ms", "planner's call, 99th percentile"),
 )
 
+BATCH = (
+    Column("run", "string", "", "key: digest of everything that decides the run's result"),
+    Column("status", "string", "", "done, error, crash, timeout or memory"),
+    Column("reason", "string", "", "why there is no result, or why the planner failed; or empty"),
+    Column("attempts", "int64", "", "how often it was tried"),
+    Column("wall_time", "float64", "s", "of the last attempt; NaN if it gave no result"),
+)
+"""Columns before those of a run's metrics. In a run without result all metrics are missing."""
+
 OF_REFERENCE = (
     "plan_lateral_change",
     "plan_speed_change",
@@ -185,8 +194,11 @@ def describe_tables() -> str:
         "Every run's folder holds these tables as parquet, and `run.json`: scenario, planner,",
         "settings, seed, versions and outcome. Made from `sumo_cohesion/experiments/columns.py` by",
         "`make docs`.\n",
+        "A batch's metrics have the columns of `batch`, then scenario, planner, the names of the",
+        "grid and seed, then the rest of `metrics`. Tables that a batch kept have the column `run`",
+        "too; its table `ego` is the ego's part of `trajectory`.\n",
     ]
-    for name, columns in TABLES.items():
+    for name, columns in {**TABLES, "batch": BATCH}.items():
         parts += [f"## {name}\n", "| column | type | unit | meaning |", "|---|---|---|---|"]
         parts += [f"| {c.name} | {c.dtype} | {c.unit} | {c.meaning} |" for c in columns]
         parts.append("")

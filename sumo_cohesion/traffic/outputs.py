@@ -45,14 +45,17 @@ class SumoOutputs:
     def read(self) -> dict[str, pd.DataFrame]:
         """Read what SUMO has written; names and units are SUMO's own.
 
-        One row is, in fcd, a vehicle at a time step; in tripinfo, a vehicle; in ssm, an encounter
-        of two, with each measure's extreme as ``minTTC_value``, ``minTTC_time``, ``minTTC_type``.
+        SUMO stamps the state after a step with the time the step began: its t is t + 0.1 s of a
+        run's own tables. One row is, in fcd, a vehicle at a time step; in tripinfo, a vehicle; in
+        ssm, an encounter of two, with each measure's extreme as ``minTTC_value``,
+        ``minTTC_time`` and ``minTTC_type``.
         """
-        return {kind: _table(_ROWS[kind](self._file(kind))) for kind in self.kinds}
+        return {kind: _table(_ROWS[kind](self._file(kind)), _ALWAYS[kind]) for kind in self.kinds}
 
 
-def _table(rows: Iterator[dict[str, str]]) -> pd.DataFrame:
-    frame = pd.DataFrame(list(rows))
+def _table(rows: Iterator[dict[str, str]], always: Sequence[str]) -> pd.DataFrame:
+    found = list(rows)
+    frame = pd.DataFrame(found) if found else pd.DataFrame(columns=list(always))
     for name in frame.columns:
         if name in _TEXT:
             frame[name] = frame[name].astype("string")
@@ -97,6 +100,12 @@ def _ssm(path: Path) -> Iterator[dict[str, str]]:
         yield row
 
 
+_ALWAYS: dict[Output, Sequence[str]] = {
+    "fcd": ("time", "id", "x", "y", "angle", "speed", "lane"),
+    "tripinfo": ("id", "depart", "arrival", "duration", "timeLoss"),
+    "ssm": ("begin", "end", "ego", "foe"),
+}
+"""Columns of a table without rows."""
 _ROWS: dict[Output, Callable[[Path], Iterator[dict[str, str]]]] = {
     "fcd": _fcd,
     "tripinfo": _tripinfo,

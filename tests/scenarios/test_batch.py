@@ -1,0 +1,402 @@
+"""Batches on real SUMO traffic: nothing lost, nothing doubled, whatever happens to them."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import pytest
+
+from sumo_cohesion import Rollout, UserError, batch, load_metrics, load_trajectories, run
+from sumo_cohesion.batches.batch import Progress, dry_run
+from sumo_cohesion.batches.store import NOT_REPEATABLE
+
+REPOSITORY = Path(__file__).resolve().parent.parent.parent
+FAULTY = "tests.scenarios.faulty_planners:"
+SHORT: dict[str, Any] = {
+    "scenarios": ["stalled", "speeding"],
+    "planners": ["nominal", "cohesive"],
+    "seeds": "0:5",
+    "set": {"duration": 2.0},
+    "grid": {"cohesion.beta": [0.03, 0.09]},
+}
+"""Of 40 rows 30 are runs of their own: nominal has no beta."""
+
+
+def toml(experiment: Mapping[str, Any], path: Path) -> Path:
+    """Write an experiment's file."""
+    tables = {k: v for k, v in experiment.items() if isinstance(v, dict)}
+    lines = [f"{k} = {json.dumps(v)}" for k, v in experiment.items() if k not in tables]
+    for name, table in tables.items():
+        lines += [f"[{name}]", *(f'"{k}" = {json.dumps(v)}' for k, v in table.items())]
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def results(folder: Path) -> pd.DataFrame:
+    """Return what must be the same whenever and wherever it was run."""
+    return load_metrics(folder).drop(columns=list(NOT_REPEATABLE))
+
+
+@pytest.fixture(scope="module")
+def uninterrupted(tmp_path_factory: pytest.TempPathFactory) -> pd.DataFrame:
+    folder = tmp_path_factory.mktemp("batch") / "whole"
+    batch(SHORT, folder, workers=2)
+    return results(folder)
+
+
+def command(file: Path, out: Path, *options: str) -> list[str]:
+    return [sys.executable, "-m", "sumo_cohesion", "batch", str(file), "--out", str(out), *options]
+
+
+def test_every_row_is_there_and_shared_runs_are_done_once(uninterrupted: pd.DataFrame) -> None:
+    assert len(uninterrupted) == 40
+    assert uninterrupted["run"].nunique() == 30
+    assert (uninterrupted["status"] == "done").all()
+    told = uninterrupted[["scenario", "planner", "cohesion.beta", "seed"]]
+    assert not told.duplicated().any()
+    by_beta = uninterrupted.query("planner == 'cohesive'").groupby("cohesion.beta")
+    means = by_beta["mean_speed"].mean()
+    assert means[0.09] != means[0.03]
+
+
+def test_killed_at_random_moments_and_resumed_it_is_the_same(
+    uninterrupted: pd.DataFrame, tmp_path: Path
+) -> None:
+    file, out = toml(SHORT, tmp_path / "short.toml"), tmp_path / "out"
+    moments = random.Random(4)
+    kills = 0
+    for _ in range(3):
+        process = subprocess.Popen(
+            command(file, out, "--workers", "2"),
+            cwd=REPOSITORY,
+            start_new_session=True,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        with pytest.raises(subprocess.TimeoutExpired):
+            process.wait(timeout=moments.uniform(1.5, 5.0))
+        os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+        kills += 1
+    assert kills == 3
+    before = len(load_metrics(out)) if (out / "manifest.json").exists() else 0
+    assert before < 40
+    batch(SHORT, out, workers=2)
+    pd.testing.assert_frame_equal(results(out), uninterrupted)
+
+
+def test_ctrl_c_stops_with_one_line_and_keeps_what_is_done(
+    uninterrupted: pd.DataFrame, tmp_path: Path
+) -> None:
+    file, out = toml(SHORT, tmp_path / "short.toml"), tmp_path / "out"
+    process = subprocess.Popen(
+        command(file, out, "--workers", "1"), cwd=REPOSITORY, stderr=subprocess.PIPE, text=True
+    )
+    journal = out / "runs" / "1of1-00001.jsonl"
+    for _ in range(300):
+        if journal.exists() and journal.stat().st_size:
+            break
+        time.sleep(0.1)
+    process.send_signal(signal.SIGINT)
+    said = process.communicate(timeout=30)[1].strip()
+    assert process.returncode == 1
+    assert said.startswith("error: interrupted with ")
+    assert "\n" not in said
+    assert 1 <= len(load_metrics(out)) < 40
+    batch(SHORT, out, workers=2)
+    pd.testing.assert_frame_equal(results(out), uninterrupted)
+
+
+def test_a_full_disk_is_one_line_and_what_was_done_stays(
+    uninterrupted: pd.DataFrame, tmp_path: Path
+) -> None:
+    # No file may grow beyond 6 kB: the journal, after a few rows, as on a disk that fills up.
+    file, out = toml(SHORT, tmp_path / "short.toml"), tmp_path / "out"
+    code = (
+        "import resource, sys; from sumo_cohesion.cli import main;"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (6000, 6000)); sys.argv[0] = 'x'; main()"
+    )
+    arguments = command(file, out, "--workers", "1")[3:]
+    done = subprocess.run(
+        [sys.executable, "-B", "-c", code, *arguments],
+        cwd=REPOSITORY,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 2, done.stderr
+    assert "cannot be written (File too large)" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert 1 <= len(load_metrics(out)) < 40
+    batch(SHORT, out, workers=2)
+    pd.testing.assert_frame_equal(results(out), uninterrupted)
+
+
+def test_bad_planners_are_rows_with_reasons_among_good_runs(tmp_path: Path) -> None:
+    names = ["Good", "SegmentationFault", "Endless", "EatsMemory", "Raises", "RaisesAtOnce"]
+    experiment = {
+        "scenarios": ["stalled"],
+        "planners": [FAULTY + name for name in names],
+        "seeds": [0, 1],
+        "set": {"duration": 2.0},
+        "limits": {"run_time": 4, "memory": 1.0, "retries": 1},
+    }
+    rows = batch(experiment, tmp_path / "out", workers=2)
+    assert len(rows) == 12
+    rows["planner"] = rows["planner"].str.removeprefix(FAULTY)
+    own = {str(name): part for name, part in rows.groupby("planner")}
+    assert (own["Good"]["status"] == "done").all()
+    assert (own["Good"]["outcome"] == "finished").all()
+    wanted = {
+        "SegmentationFault": ("crash", "SIGSEGV", 2),
+        "Endless": ("timeout", "no result after 4 s", 2),
+        "EatsMemory": ("memory", "needed more than 1 GB", 2),
+        "RaisesAtOnce": ("error", "no such road", 1),  # it would raise again: not retried
+        "Raises": ("done", "no plan in 10 of 20 steps, first: ValueError: no idea where to go", 1),
+    }
+    for name, (status, reason, attempts) in wanted.items():
+        assert (own[name]["status"] == status).all(), name
+        assert own[name]["reason"].str.contains(reason, regex=False).all(), name
+        assert (own[name]["attempts"] == attempts).all(), name
+    assert own["SegmentationFault"]["success"].isna().all()
+    # Resumed, failed runs are left alone unless asked for.
+    counted: list[Progress] = []
+    batch(experiment, tmp_path / "out", workers=2, progress=counted.append)
+    assert counted == []
+    only = experiment | {"planners": [FAULTY + "RaisesAtOnce"]}
+    batch(only, tmp_path / "out", workers=2, retry_failed=True, progress=counted.append)
+    assert counted[-1] == Progress(2, 2, 2)
+
+
+def test_a_dask_cluster_that_loses_a_worker_gives_the_same_rows(
+    uninterrupted: pd.DataFrame, tmp_path: Path
+) -> None:
+    pytest.importorskip("distributed")
+    if not Path("/proc/self/task").exists():
+        pytest.skip("finding the workers needs Linux")
+    killed: list[int] = []
+
+    def kill_one(progress: Progress) -> None:
+        if progress.done < 12 or killed:
+            return
+        for entry in Path("/proc/self/task").glob("*/children"):
+            for pid in entry.read_text().split():
+                if not killed and "spawn_main" in Path(f"/proc/{pid}/cmdline").read_text():
+                    os.kill(int(pid), signal.SIGKILL)
+                    killed.append(int(pid))
+
+    batch(SHORT, tmp_path / "out", workers=2, dask="local", progress=kill_one)
+    assert killed
+    pd.testing.assert_frame_equal(results(tmp_path / "out"), uninterrupted)
+
+
+def test_shards_share_a_folder_and_make_the_whole(
+    uninterrupted: pd.DataFrame, tmp_path: Path
+) -> None:
+    file, out = toml(SHORT, tmp_path / "short.toml"), tmp_path / "out"
+    shards = [
+        subprocess.Popen(
+            command(file, out, "--workers", "1", "--shard", f"{i}/2"),
+            cwd=REPOSITORY,
+            stdout=subprocess.DEVNULL,
+        )
+        for i in (1, 2)
+    ]
+    assert [shard.wait() for shard in shards] == [0, 0]
+    pd.testing.assert_frame_equal(results(out), uninterrupted)
+    whole = pd.read_parquet(out / "metrics.parquet").drop(columns=list(NOT_REPEATABLE))
+    assert len(whole) == 40
+
+
+def own_scenario(folder: Path) -> Path:
+    """Copy a bundled scenario with its files."""
+    text = (REPOSITORY / "scenarios" / "stalled.toml").read_text()
+    (folder / "mine.toml").write_text(text.replace('name = "stalled"', 'name = "mine"'))
+    for kind, name in (("networks", "highway.net.xml"), ("routes", "stalled.rou.xml")):
+        shutil.copy(REPOSITORY / kind / name, folder / name)
+    return folder / "mine.toml"
+
+
+def counting(total: list[int]) -> Callable[[Progress], None]:
+    return lambda progress: total.append(progress.total)
+
+
+def test_a_changed_network_is_never_mixed_with_old_results(tmp_path: Path) -> None:
+    own_scenario(tmp_path)
+    experiment = {
+        "scenarios": ["mine.toml"],
+        "planners": ["sumo"],
+        "seeds": "0:3",
+        "set": {"duration": 2.0},
+    }
+    file, out = toml(experiment, tmp_path / "mine_too.toml"), tmp_path / "out"
+    first = batch(file, out, workers=1)
+    network = tmp_path / "highway.net.xml"
+    before = network.read_text()
+    network.write_text(before.replace('speed="25.00"', 'speed="35.00"'))
+    assert network.read_text() != before
+    second = batch(file, out, workers=1)
+    assert len(second) == 3
+    assert not set(second["run"]) & set(first["run"])
+    assert (second["mean_speed"] > first["mean_speed"] + 0.5).all()
+    # Back to what it was: nothing is run again, and only the old rows are there.
+    network.write_text(before)
+    total: list[int] = []
+    pd.testing.assert_frame_equal(batch(file, out, progress=counting(total)), first)
+    assert total == []
+
+
+def test_a_network_that_changes_while_it_runs_stops_no_run_from_being_true(tmp_path: Path) -> None:
+    own_scenario(tmp_path)
+    experiment = {
+        "scenarios": [str(tmp_path / "mine.toml")],
+        "planners": ["sumo"],
+        "seeds": "0:4",
+        "set": {"duration": 1.0},
+    }
+    network = tmp_path / "highway.net.xml"
+
+    def change(progress: Progress) -> None:
+        if progress.done == 1:
+            network.write_text(network.read_text().replace('speed="25.00"', 'speed="15.00"'))
+
+    rows = batch(experiment, tmp_path / "out", workers=1, progress=change)
+    late = rows[rows["status"] == "error"]
+    assert 1 <= len(late) < 4
+    assert late["reason"].str.contains("not those the batch was started with").all()
+
+
+def test_kept_tables_are_found_by_what_they_are_of(tmp_path: Path) -> None:
+    experiment = {
+        "scenarios": ["stalled"],
+        "planners": ["nominal", "cohesive"],
+        "seeds": "0:2",
+        "set": {"duration": 12.0},
+        "grid": {"randomize.humans": [[3, 3], [5, 5]]},
+    }
+    out = tmp_path / "out"
+    batch(experiment, out, workers=2)
+    with pytest.raises(UserError, match="not kept"):
+        load_trajectories(out)
+    # The same runs, now with tables: they have to be done again.
+    total: list[int] = []
+    keeping = experiment | {
+        "keep": ["trajectory", "ego"],
+        "sumo_outputs": ["fcd", "tripinfo", "ssm"],
+    }
+    batch(keeping, out, workers=2, progress=counting(total))
+    assert total[-1] == 8
+    some = load_trajectories(out, {"planner": "cohesive", "randomize.humans": [[3, 3]], "seed": 1})
+    assert some["run"].nunique() == 1
+    assert list(some.columns[:5]) == ["run", "scenario", "planner", "randomize.humans", "seed"]
+    assert set(some["vehicle"]) == {"ego", "lead_1", "lead_2", "lead_3"}
+    ego = load_trajectories(out, {"seed": [0, 1]}, table="ego")
+    assert ego["run"].nunique() == 8
+    fcd = load_trajectories(out, {"seed": 0}, table="sumo_fcd")
+    same = fcd[(fcd["run"] == fcd["run"].iloc[0]) & (fcd["id"] == "ego")]
+    assert same["time"].is_monotonic_increasing
+    assert fcd["speed"].dtype == float
+    trips = load_trajectories(out, table="sumo_tripinfo")
+    assert {"stalled", "ego"} <= set(trips["id"])
+    # Nobody has come near another yet.
+    conflicts = load_trajectories(out, table="sumo_ssm")
+    assert {"ego", "foe"} <= set(conflicts.columns)
+    with pytest.raises(UserError, match="not told apart by 'colour'"):
+        load_trajectories(out, {"colour": 1})
+    with pytest.raises(UserError, match="no run there fits"):
+        load_trajectories(out, {"seed": 99})
+
+
+def test_sumos_own_outputs_come_with_one_run_too(tmp_path: Path) -> None:
+    rollout = run("stalled", "nominal", 0, sumo_outputs=("fcd", "ssm"), out=tmp_path / "run")
+    conflicts = rollout.sumo["ssm"]
+    hit = conflicts[(conflicts["ego"] == "ego") & (conflicts["foe"] == "stalled")]
+    assert hit["minTTC_value"].min() == 0.0
+    again = Rollout.read(tmp_path / "run")
+    pd.testing.assert_frame_equal(again.sumo["ssm"], conflicts)
+    # SUMO's record of the ego is the own one: of the front bumper, stamped with the step's begin.
+    fcd = again.sumo["fcd"].query("id == 'ego'")
+    fcd = fcd.assign(time=(fcd["time"] + 0.1).round(1)).set_index("time")
+    own = again.trajectory.query("vehicle == 'ego'").set_index("time")
+    own.index = own.index.to_numpy().round(1)
+    both = own.join(fcd, rsuffix="_front", how="inner").iloc[1:]
+    assert len(both) > 100
+    assert (both["x_front"] - both["x"]).to_numpy() == pytest.approx(2.5, abs=0.05)
+
+
+def test_a_dry_run_counts_and_keeps_nothing(tmp_path: Path) -> None:
+    plan = dry_run(SHORT, tmp_path / "out").set_index(["scenario", "planner"])
+    assert plan["runs"].to_dict() == {
+        ("stalled", "nominal"): 5,
+        ("stalled", "cohesive"): 10,
+        ("speeding", "nominal"): 5,
+        ("speeding", "cohesive"): 10,
+    }
+    assert (plan["seconds"] > 0.1).all()
+    assert not (tmp_path / "out").exists()
+
+
+def test_two_batches_do_not_work_in_one_folder(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    refused: list[str] = []
+
+    def again(progress: Progress) -> None:
+        if not refused:
+            with pytest.raises(UserError, match="a batch is running there") as error:
+                batch(SHORT, out)
+            refused.append(str(error.value))
+
+    batch(
+        SHORT | {"scenarios": ["stalled"], "planners": ["sumo"], "seeds": [0]}, out, progress=again
+    )
+    assert refused
+
+
+def test_what_a_kill_has_torn_is_left_out(tmp_path: Path) -> None:
+    small = SHORT | {"scenarios": ["stalled"], "planners": ["sumo"], "grid": {}, "seeds": "0:3"}
+    out = tmp_path / "out"
+    whole = batch(small, out, workers=1)
+    # As if killed while it wrote the last row, before the rows became a part.
+    part = out / "runs" / "1of1-00001.parquet"
+    lines = pd.read_parquet(part).to_json(orient="records", lines=True, double_precision=15)
+    part.unlink()
+    part.with_suffix(".jsonl").write_text(lines.rstrip()[:-40])
+    assert len(load_metrics(out)) == 2
+    total: list[int] = []
+    again = batch(small, out, workers=1, progress=counting(total))
+    assert total == [1]
+    assert again["seed"].tolist() == whole["seed"].tolist()
+
+
+def test_threads_may_ask_for_runs_at_once_and_close_ends_them() -> None:
+    from sumo_cohesion.experiments.workers import CallFailedError, Limits, Workers
+
+    workers = Workers("time:sleep", Limits(60.0, 1.0))
+    ended: list[str] = []
+
+    def wait() -> None:
+        try:
+            workers.call(50.0)
+        except CallFailedError as error:
+            ended.append(error.kind)
+
+    threads = [threading.Thread(target=wait) for _ in range(2)]
+    for thread in threads:
+        thread.start()
+    time.sleep(2.0)
+    workers.close()
+    for thread in threads:
+        thread.join(timeout=20)
+    assert ended == ["crash", "crash"]
