@@ -6,7 +6,7 @@ import casadi as ca
 import numpy as np
 
 from sumo_cohesion.planning import reward
-from sumo_cohesion.planning.mpc import FAR_AWAY
+from sumo_cohesion.planning.problem import FAR_AWAY
 from sumo_cohesion.planning.settings import PlannerSettings
 from sumo_cohesion.road import Road
 from sumo_cohesion.state import FloatArray, Observation

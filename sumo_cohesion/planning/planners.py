@@ -19,6 +19,7 @@ from sumo_cohesion.errors import UserError
 from sumo_cohesion.perception.history import History
 from sumo_cohesion.planning.dynamics import DT
 from sumo_cohesion.planning.fallback import fallback
+from sumo_cohesion.planning.problem import FAR_AWAY, Problem, Solution
 from sumo_cohesion.planning.settings import PlannerSettings
 from sumo_cohesion.road import Road
 from sumo_cohesion.social.agreement import Agreement, agree, combine
@@ -31,7 +32,7 @@ from sumo_cohesion.social.settings import CohesionSettings, as_printed
 from sumo_cohesion.state import AgreementRow, Control, FloatArray, Observation, Plan
 
 if TYPE_CHECKING:
-    from sumo_cohesion.planning.mpc import Mpc, Problem, Solution
+    from sumo_cohesion.planning.mpc import Mpc
 
 
 @runtime_checkable
@@ -114,8 +115,6 @@ class CohesivePlanner:
     def _problem(
         self, observation: Observation, groups: tuple[Agreement, ...], place: Place
     ) -> Problem:
-        from sumo_cohesion.planning.mpc import FAR_AWAY, Problem
-
         horizon, road, ego = self.settings.horizon, self._road, observation.ego
         # Where the ego will be if it keeps its speed: the road is looked up there.
         s = ego.s + DT * ego.speed * np.arange(horizon + 1)

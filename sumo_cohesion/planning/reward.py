@@ -40,36 +40,57 @@ class StageInputs(NamedTuple):
 
 def terms(state: Any, control: Any, inputs: StageInputs, ego_width: Any) -> dict[str, Any]:
     """Reward terms by name, unweighted; costs are negative."""
+    right, left = _beyond_edges(state[1], inputs, ego_width)
     return {
-        "lane": _lane(state[1], inputs),
-        "edge": -_edge(state[1], inputs, ego_width),
+        # One Gaussian per lane. It saturates: far from every centre nothing pulls, so that the
+        # car may cross a line when it has a reason to.
+        "lane": ca.sum1(ca.exp(-0.5 * _lanes(state[1], inputs) ** 2)),
+        # Square of how far the ego's side is beyond the margin to either edge.
+        "edge": -(ca.fmax(right, 0) ** 2 + ca.fmax(left, 0) ** 2),
         "speed": -((state[3] - inputs.speed_limit) ** 2),
-        "car": -_cars(state, inputs.cars),
+        # One oriented Gaussian per car, as long and as wide as the two cars together.
+        "car": -ca.sum1(ca.exp(-0.5 * _cars(state, inputs.cars))),
         "curvature": -(control[0] ** 2),
         "acceleration": -(control[1] ** 2),
     }
 
 
-def _lane(d: Any, inputs: StageInputs) -> Any:
-    """One Gaussian per lane.
+def squares(
+    state: Any, control: Any, inputs: StageInputs, ego_width: Any
+) -> dict[str, list[tuple[Any, Any]]]:
+    """Return the same terms as pairs of residual r and weight w >= 0, both columns.
 
-    It saturates: far from every centre nothing pulls, so that the car may cross a line when it
-    has a reason to.
+    The gradient of a term's cost is J'(w r), J the residuals' Jacobian; J'diag(w)J stands for its
+    Hessian and is never negative, as the Hessian of a Gaussian is far from its centre.
     """
-    z = (d - inputs.lanes) / (LANE_SIGMA * inputs.lane_widths)
-    return ca.sum1(ca.exp(-0.5 * z**2))
+    right, left = _beyond_edges(state[1], inputs, ego_width)
+    lanes = _lanes(state[1], inputs)
+    near = ca.exp(-0.25 * _cars(state, inputs.cars))
+    return {
+        "lane": [(lanes, ca.exp(-0.5 * lanes**2))],
+        "edge": [(right, 2.0 * (right > 0)), (left, 2.0 * (left > 0))],
+        "speed": [(state[3] - inputs.speed_limit, 2.0)],
+        "car": [(near, 2.0 * ca.DM.ones(near.shape[0]))],
+        "curvature": [(control[0], 2.0)],
+        "acceleration": [(control[1], 2.0)],
+    }
 
 
-def _edge(d: Any, inputs: StageInputs, ego_width: Any) -> Any:
-    """Square of how far (m) the ego's side is beyond the margin to either edge."""
+def _lanes(d: Any, inputs: StageInputs) -> Any:
+    """Distance to every lane's centre, in standard deviations of its Gaussian."""
+    return (d - inputs.lanes) / (LANE_SIGMA * inputs.lane_widths)
+
+
+def _beyond_edges(d: Any, inputs: StageInputs, ego_width: Any) -> tuple[Any, Any]:
+    """Metres that the ego's side is beyond the margin to the right and to the left edge."""
     reach = ego_width / 2 + EDGE_MARGIN
-    return ca.fmax(inputs.right + reach - d, 0) ** 2 + ca.fmax(d + reach - inputs.left, 0) ** 2
+    return inputs.right + reach - d, d + reach - inputs.left
 
 
 def _cars(state: Any, cars: Any) -> Any:
-    """One oriented Gaussian per car, as long and as wide as the two cars together."""
+    """Squared distance to every car, in its half length along and CAR_SIGMA_LATERAL across."""
     ds, dd = state[0] - cars[0, :], state[1] - cars[1, :]
     cos, sin, half_length, half_width = cars[2, :], cars[3, :], cars[4, :], cars[5, :]
     along = (ds * cos + dd * sin) / half_length
     across = (dd * cos - ds * sin) / (CAR_SIGMA_LATERAL * half_width)
-    return ca.sum2(ca.exp(-0.5 * (along**2 + across**2)))
+    return (along**2 + across**2).T

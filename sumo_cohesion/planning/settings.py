@@ -42,7 +42,8 @@ class PlannerSettings(BaseModel):
     max_curvature : bound (1/m) on the driven path's curvature.
     max_braking, max_acceleration : bounds (m/s²) on the change of speed.
     cars : how many of the nearest vehicles are avoided.
-    solver : CasADi's interior point methods: fatrop exploits the structure, ipopt is general.
+    solver : ilqr (planning.ilqr), the fast one; fatrop and ipopt, CasADi's interior point methods;
+        lbfgs, the paper's own.
     max_iterations : after which a solve has failed. Not a time limit, which would make two
         runs of the same seed differ.
     """
@@ -55,6 +56,6 @@ class PlannerSettings(BaseModel):
     max_braking: Positive = 8.0
     max_acceleration: Positive = 4.8
     cars: Annotated[int, Field(ge=1, le=100)] = 8
-    solver: Literal["fatrop", "ipopt"] = "fatrop"
+    solver: Literal["ilqr", "fatrop", "ipopt", "lbfgs"] = "ilqr"
     max_iterations: Annotated[int, Field(ge=1)] = 100
     reward: RewardWeights = RewardWeights()

@@ -12,7 +12,8 @@ from sumo_cohesion.errors import UserError
 from sumo_cohesion.perception.history import History
 from sumo_cohesion.planning import dynamics
 from sumo_cohesion.planning.fallback import fallback
-from sumo_cohesion.planning.mpc import Mpc, Problem
+from sumo_cohesion.planning.mpc import Mpc
+from sumo_cohesion.planning.problem import Problem, Solution
 from sumo_cohesion.planning.planners import (
     CohesivePlanner,
     Planner,
@@ -213,9 +214,9 @@ def test_warm_start_shifts_time_not_controls(highway: Road) -> None:
     t = SETTINGS.horizon
     states = np.arange(4.0 * (t + 1)).reshape(t + 1, 4)
     controls = np.column_stack((np.arange(float(t)), 10.0 + np.arange(float(t))))
-    shifted = mpc._shifted(states, controls)
-    x, u = mpc._unpack(shifted)
-    assert np.array_equal(x[:-1], states[1:])
+    shifted = mpc._shifted(Solution(states, controls, True, "solved", 1, 0.0, {}))
+    u = shifted.controls
+    assert np.array_equal(shifted.states[:-1], states[1:])
     assert u[:, 0] == pytest.approx([*range(1, t), t - 1])
     assert u[:, 1] == pytest.approx([*range(11, 10 + t), 9 + t])
 

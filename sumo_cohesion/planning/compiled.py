@@ -1,0 +1,117 @@
+"""CasADi Functions as machine code, where a C compiler is found; never needed.
+
+The C code is CasADi's own. The library is kept under a digest of that code, the compiler and its
+options, in the user's cache folder ($XDG_CACHE_HOME, ~/.cache): it is made once per machine.
+Floating point is strict: compiled functions return what CasADi's virtual machine returns, bit for
+bit, so that results do not depend on whether there is a compiler.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import os
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Iterator, Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
+
+from sumo_cohesion.state import FloatArray
+
+SWITCH = "SUMO_COHESION_COMPILE"
+"""Environment variable; 0 keeps CasADi's virtual machine."""
+OPTIONS = ("-O2", "-ffp-contract=off", "-fPIC", "-shared")
+_PATIENCE = 300.0
+"""Seconds after which a compiler is given up."""
+
+
+def compiled(functions: Sequence[Any]) -> tuple[list[Any], str]:
+    """Return the same functions compiled, and "compiled"; or as they are, and why."""
+    if os.environ.get(SWITCH) == "0":
+        return list(functions), f"not compiled: {SWITCH} is 0"
+    compiler = _find_compiler()
+    if compiler is None:
+        return list(functions), "not compiled: no C compiler (cc, gcc or clang) found"
+    try:
+        library = _library(functions, compiler)
+        return [ca.external(f.name(), str(library)) for f in functions], "compiled"
+    except (OSError, subprocess.SubprocessError, RuntimeError) as error:
+        said = " ".join(str(error).split())[:200]
+        return list(functions), f"not compiled: {said}"
+
+
+def _find_compiler() -> str | None:
+    wanted = (os.environ.get("CC"), "cc", "gcc", "clang")
+    return next((path for name in wanted if name and (path := shutil.which(name))), None)
+
+
+def _library(functions: Sequence[Any], compiler: str) -> Path:
+    """Path of the functions' library, made if it is not there."""
+    code = _c_code(functions)
+    stat = Path(compiler).resolve().stat()
+    about = f"{compiler} {stat.st_size} {stat.st_mtime_ns} {OPTIONS} {version('casadi')}\n{code}"
+    folder = cache_folder()
+    folder.mkdir(parents=True, exist_ok=True)
+    library = folder / f"{hashlib.sha256(about.encode()).hexdigest()[:32]}.so"
+    if not library.exists():
+        with _alone(library.with_suffix(".lock")):  # one compiles, the others wait for it
+            if not library.exists():
+                _compile(code, compiler, library)
+    return library
+
+
+def cache_folder() -> Path:
+    """Where compiled libraries are kept."""
+    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return Path(base) / "sumo-cohesion"
+
+
+def _c_code(functions: Sequence[Any]) -> str:
+    generator = ca.CodeGenerator("planner.c")
+    for function in functions:
+        generator.add(function)
+    return str(generator.dump())
+
+
+def _compile(code: str, compiler: str, library: Path) -> None:
+    with tempfile.TemporaryDirectory(dir=library.parent) as folder:
+        source, new = Path(folder) / "planner.c", Path(folder) / "planner.so"
+        source.write_text(code)
+        command = [compiler, *OPTIONS, str(source), "-o", str(new), "-lm"]
+        done = subprocess.run(
+            command, capture_output=True, text=True, timeout=_PATIENCE, check=False
+        )
+        if done.returncode:
+            raise RuntimeError(f"{compiler} failed: {done.stderr[-200:]}")
+        new.replace(library)
+
+
+@contextlib.contextmanager
+def _alone(path: Path) -> Iterator[None]:
+    """Wait until no other process holds this lock; ended processes let go of it."""
+    with path.open("w") as file:
+        with contextlib.suppress(ImportError, OSError):
+            import fcntl
+
+            fcntl.flock(file, fcntl.LOCK_EX)
+        yield
+
+
+class BoundCall:
+    """A call without arguments that reads and writes arrays in place: nothing is converted."""
+
+    def __init__(self, function: Any, inputs: list[FloatArray], outputs: list[FloatArray]) -> None:
+        self._keep = (function, inputs, outputs)  # CasADi keeps only their addresses
+        self._buffer, self._run = function.buffer()
+        for i, array in enumerate(inputs):
+            self._buffer.set_arg(i, array.reshape(-1).data)
+        for i, array in enumerate(outputs):
+            self._buffer.set_res(i, array.reshape(-1).data)
+
+    def __call__(self) -> None:
+        self._run()

@@ -1,0 +1,301 @@
+"""The fast solver: control-limited iterative LQR over CasADi expressions.
+
+Per iteration one backward pass (a quadratic model of the cost-to-go, stage by stage, Riccati) and
+forward passes (roll the policy out, with shorter steps until the cost falls). The steps come from
+the exact Hessian where it is convex enough, else from a Gauss-Newton one, which always descends.
+Bounds on the controls are part of every stage's quadratic problem, whose two unknowns are solved for
+exactly.
+
+Sources: W. Li and E. Todorov 2004 (iterative LQR); Y. Tassa, N. Mansard and E. Todorov 2014
+(control-limited DDP, the line search and the regularisation).
+
+Both passes are CasADi Functions without loops or branches. They run in CasADi's virtual machine,
+and several times faster compiled (planning.compiled).
+"""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from sumo_cohesion.planning.compiled import BoundCall, compiled
+from sumo_cohesion.planning.problem import Guess, Problem, Solution
+from sumo_cohesion.planning.settings import PlannerSettings
+from sumo_cohesion.planning.stage import (
+    CONTROL_SCALE,
+    TERMS,
+    Stage,
+    StageParameters,
+    control_bounds,
+    make_stage,
+    standstill,
+    stopping_stage,
+)
+
+TOLERANCE = 1e-7
+"""Relative decrease of the cost at which an iteration is the last one."""
+_LEAST_CURVATURE = 1e-8
+_SHORTEST_STEP = 0.01
+_SHORTEN = 0.4
+_SUFFICIENT = 1e-4
+"""Share of the decrease promised by the model that a step must give."""
+_REGULARISATION = (1e-9, 1e-4, 1e4)
+"""Least, first one that acts, and largest value added to the controls' Hessian."""
+
+
+class Ilqr:
+    """Solver for problems of one shape; its functions are built once."""
+
+    name = "ilqr"
+
+    def __init__(self, settings: PlannerSettings, n_lanes: int) -> None:
+        self._settings = settings
+        self._parameters = StageParameters(settings, n_lanes)
+        stage = make_stage(settings, self._parameters)
+        functions, self.how = compiled(
+            [
+                _backward_pass(stage, settings),
+                _forward_pass(stage, settings),
+            ]
+        )
+        self._backward, self._forward = functions
+        self._allocate()
+
+    def _allocate(self) -> None:
+        """Make the arrays that both functions read and write in place."""
+        t, f = self._settings.horizon, np.zeros
+        self._x, self._x_new = f((t + 1, 4)), f((t + 1, 4))
+        self._u, self._u_new = f((t, 2)), f((t, 2))
+        self._p = f((t, self._parameters.size))
+        self._low, self._high = f((t, 2)), f((t, 2))
+        self._step, self._gain = f((t, 2)), f((t, 4, 2))
+        self._exact, self._mu, self._length = f(1), f(1), f(1)
+        self._change, self._convexity, self._terms = f(1), f(1), f(len(TERMS))
+        bounds = [self._low, self._high]
+        # A C-ordered (T, n) array is a CasADi matrix of T columns.
+        self._run_backward = BoundCall(
+            self._backward,
+            [self._x, self._u, self._p, *bounds, self._exact, self._mu],
+            [self._step, self._gain, self._change, self._convexity],
+        )
+        self._run_forward = BoundCall(
+            self._forward,
+            [self._x, self._u, self._p, *bounds, self._step, self._gain, self._length],
+            [self._x_new, self._u_new, self._terms],
+        )
+
+    def solve(self, problem: Problem, guess: Guess) -> Solution:
+        """Solve from a guess of the controls; the guess of the states is not needed."""
+        start = time.perf_counter()
+        self._load(problem, guess)
+        cost = self._roll_out(0.0)
+        if not np.isfinite(cost):
+            return self._result("cost is not finite", 0, start, solved=False)
+        self._accept()
+        exact, mu = True, _REGULARISATION[0]
+        for iteration in range(1, self._settings.max_iterations + 1):
+            self._exact[0], self._mu[0] = exact, mu
+            self._run_backward()
+            if exact and not self._convexity[0] > _LEAST_CURVATURE:
+                exact = False
+                continue
+            promised = -self._change[0]
+            if promised < TOLERANCE * (1.0 + abs(cost)):
+                return self._result("solved", iteration, start, solved=True)
+            new_cost = self._search(cost, promised)
+            if new_cost is not None:
+                self._accept()
+                small = cost - new_cost < TOLERANCE * (1.0 + abs(cost))
+                cost, exact, mu = new_cost, True, max(0.1 * mu, _REGULARISATION[0])
+                if small:
+                    return self._result("solved", iteration, start, solved=True)
+            elif exact:
+                exact = False
+            else:
+                mu = max(100.0 * mu, _REGULARISATION[1])
+                if mu > _REGULARISATION[2]:
+                    return self._result("no step lowers the cost", iteration, start, solved=False)
+        return self._result(
+            "too many iterations", self._settings.max_iterations, start, solved=False
+        )
+
+    def _load(self, problem: Problem, guess: Guess) -> None:
+        self._parameters.fill(problem, self._p.T)
+        self._low[:], self._high[:] = control_bounds(self._settings, problem)
+        self._x[0] = problem.ego
+        np.clip(guess.controls / CONTROL_SCALE, self._low, self._high, out=self._u)
+        self._step[:], self._gain[:] = 0.0, 0.0
+
+    def _search(self, cost: float, promised: float) -> float | None:
+        """Shorten the step until it lowers the cost enough; None if no length does."""
+        length = 1.0
+        while length > _SHORTEST_STEP:
+            new_cost = self._roll_out(length)
+            if new_cost < cost - _SUFFICIENT * length * promised:
+                return new_cost
+            length *= _SHORTEN
+        return None
+
+    def _roll_out(self, length: float) -> float:
+        self._length[0] = length
+        self._run_forward()
+        return -float(self._terms.sum())
+
+    def _accept(self) -> None:
+        self._x[:], self._u[:] = self._x_new, self._u_new
+        self._accepted = self._terms.copy()
+
+    def _result(self, status: str, iterations: int, start: float, *, solved: bool) -> Solution:
+        if not solved:
+            return Solution(
+                np.zeros((0, 0)),
+                np.zeros((0, 0)),
+                False,
+                f"{self.name} returned {status}",
+                iterations,
+                time.perf_counter() - start,
+                {},
+            )
+        return Solution(
+            states=self._x.copy(),
+            controls=self._u * CONTROL_SCALE,
+            solved=True,
+            status=status,
+            iterations=iterations,
+            wall_time=time.perf_counter() - start,
+            reward=dict(zip(TERMS, self._accepted.tolist(), strict=True)),
+        )
+
+
+def _backward_pass(stage: Stage, settings: PlannerSettings) -> Any:
+    """(x, u, p, low, high, exact, mu) -> (steps, gains, change of cost, least curvature)."""
+    one = _riccati_step(stage, settings)
+    t = settings.horizon
+    x, u = ca.MX.sym("x", 4, t + 1), ca.MX.sym("u", 2, t)
+    p = ca.MX.sym("p", stage.parameters.shape[0], t)
+    low, high = ca.MX.sym("low", 2, t), ca.MX.sym("high", 2, t)
+    exact, mu = ca.MX.sym("exact"), ca.MX.sym("mu")
+    gradient, hessian, change = ca.MX.zeros(4), ca.MX.zeros(4, 4), ca.MX(0)
+    steps, gains, curvatures = [ca.MX()] * t, [ca.MX()] * t, []
+    for i in reversed(range(t)):
+        gradient, hessian, steps[i], gains[i], gain, curvature = one(
+            gradient, hessian, x[:, i], u[:, i], p[:, i], low[:, i], high[:, i], exact, mu
+        )
+        change += gain
+        curvatures.append(curvature)
+    outputs = [ca.horzcat(*steps), ca.horzcat(*gains), change, ca.mmin(ca.vertcat(*curvatures))]
+    return ca.Function("backward", [x, u, p, low, high, exact, mu], outputs)
+
+
+def _riccati_step(stage: Stage, settings: PlannerSettings) -> Any:
+    """One stage of the backward pass: the cost-to-go before it, from the one after it."""
+    gradient, hessian = ca.SX.sym("gradient", 4), ca.SX.sym("hessian", 4, 4)
+    low, high, exact, mu = (ca.SX.sym(n, k) for n, k in (("l", 2), ("h", 2), ("e", 1), ("m", 1)))
+    z = ca.vertcat(stage.state, stage.control)
+    # Exact: the dynamics' own curvature, weighted by the cost-to-go, belongs to it (DDP).
+    newton, _ = ca.hessian(stage.cost + ca.dot(gradient, stage.next_state), z)
+    jacobian = ca.jacobian(stage.residuals, z)
+    gauss_newton = jacobian.T @ (ca.repmat(stage.residual_weights, 1, 6) * jacobian)
+    move = ca.jacobian(stage.next_state, z)
+    model = exact * newton + (1.0 - exact) * gauss_newton + move.T @ hessian @ move
+    slope = ca.gradient(stage.cost, z) + move.T @ gradient
+    xx, ux, uu = model[:4, :4], model[4:, :4], model[4:, 4:]
+    x_slope, u_slope = slope[:4], slope[4:]
+
+    damped = uu + mu * ca.SX.eye(2)
+    stop = standstill(stage.state, settings)
+    stops = stop > low[1]
+    below = ca.vertcat(low[0], ca.fmax(low[1], stop)) - stage.control
+    step, free = _box_step(damped, u_slope, below, high - stage.control)
+    gain = _gain(damped, ux, free)
+    # Held at standstill: braking less hard from a lower speed is part of the policy.
+    held = ca.logic_and(ca.logic_and(stops, ca.logic_not(free[1])), step[1] <= below[1] + 1e-9)
+    gain[1, 3] = ca.if_else(held, ca.gradient(stop, stage.state)[3], gain[1, 3])
+    gradient_before = x_slope + gain.T @ (uu @ step + u_slope) + ux.T @ step
+    hessian_before = xx + gain.T @ uu @ gain + gain.T @ ux + ux.T @ gain
+    change = ca.dot(step, u_slope) + 0.5 * ca.dot(step, uu @ step)
+    return ca.Function(
+        "riccati",
+        [gradient, hessian, stage.state, stage.control, stage.parameters, low, high, exact, mu],
+        [
+            gradient_before,
+            0.5 * (hessian_before + hessian_before.T),
+            step,
+            gain,
+            change,
+            _least_eigenvalue(damped),
+        ],
+        {"cse": True},
+    )
+
+
+def _box_step(h: Any, g: Any, low: Any, high: Any) -> tuple[Any, list[Any]]:
+    """Minimise u'hu/2 + g'u over a box, u of two entries; and which entries are free.
+
+    The minimum is the unconstrained one, or lies on one of the four sides.
+    """
+
+    def value(u: Any) -> Any:
+        return 0.5 * ca.dot(u, h @ u) + ca.dot(g, u)
+
+    def clip(v: Any, i: int) -> Any:
+        return ca.fmin(ca.fmax(v, low[i]), high[i])
+
+    best = _solve_2x2(h, -g)
+    inside = ca.logic_and(ca.logic_and(best[0] >= low[0], best[0] <= high[0]), best[1] >= low[1])
+    inside = ca.logic_and(inside, best[1] <= high[1])
+    sides = [ca.vertcat(e, clip(-(g[1] + h[0, 1] * e) / h[1, 1], 1)) for e in (low[0], high[0])]
+    sides += [ca.vertcat(clip(-(g[0] + h[0, 1] * e) / h[0, 0], 0), e) for e in (low[1], high[1])]
+    side, cost = sides[0], value(sides[0])
+    for other in sides[1:]:
+        lower = value(other) < cost
+        side, cost = ca.if_else(lower, other, side), ca.if_else(lower, value(other), cost)
+    step = ca.if_else(inside, best, side)
+    free = [ca.logic_and(step[i] > low[i] + 1e-12, step[i] < high[i] - 1e-12) for i in range(2)]
+    return step, free
+
+
+def _gain(h: Any, ux: Any, free: list[Any]) -> Any:
+    """Feedback of the free controls on the state: (2, 4); what is at a bound stays there."""
+    both = ca.logic_and(*free)
+    coupled = _solve_2x2(h, -ux)
+    alone = [ca.if_else(free[i], -ux[i, :] / h[i, i], 0) for i in range(2)]
+    return ca.vertcat(*[ca.if_else(both, coupled[i, :], alone[i]) for i in range(2)])
+
+
+def _solve_2x2(h: Any, b: Any) -> Any:
+    determinant = h[0, 0] * h[1, 1] - h[0, 1] * h[0, 1]
+    first = (h[1, 1] * b[0, :] - h[0, 1] * b[1, :]) / determinant
+    second = (h[0, 0] * b[1, :] - h[0, 1] * b[0, :]) / determinant
+    return ca.vertcat(first, second)
+
+
+def _least_eigenvalue(h: Any) -> Any:
+    mean, half = 0.5 * (h[0, 0] + h[1, 1]), 0.5 * (h[0, 0] - h[1, 1])
+    return mean - ca.sqrt(half**2 + h[0, 1] ** 2)
+
+
+def _forward_pass(stage: Stage, settings: PlannerSettings) -> Any:
+    """(x, u, p, low, high, steps, gains, length) -> (new x, new u, terms summed over stages)."""
+    one = stopping_stage(stage, settings)
+    t = settings.horizon
+    x, u = ca.MX.sym("x", 4, t + 1), ca.MX.sym("u", 2, t)
+    p = ca.MX.sym("p", stage.parameters.shape[0], t)
+    low, high = ca.MX.sym("low", 2, t), ca.MX.sym("high", 2, t)
+    steps, gains, length = ca.MX.sym("steps", 2, t), ca.MX.sym("gains", 2, 4 * t), ca.MX.sym("a")
+    states, controls, total = [x[:, 0]], [], ca.MX.zeros(len(TERMS))
+    for i in range(t):
+        feedback = gains[:, 4 * i : 4 * i + 4] @ (states[-1] - x[:, i])
+        wanted = u[:, i] + length * steps[:, i] + feedback
+        state, control, terms = one(states[-1], wanted, p[:, i], low[:, i], high[:, i])
+        states.append(state)
+        controls.append(control)
+        total += terms
+    return ca.Function(
+        "forward",
+        [x, u, p, low, high, steps, gains, length],
+        [ca.horzcat(*states), ca.horzcat(*controls), total],
+    )

@@ -1,0 +1,85 @@
+"""Reference: the paper's own method, L-BFGS on the controls alone (section IV), by SciPy."""
+
+from __future__ import annotations
+
+import time
+
+import casadi as ca
+import numpy as np
+from scipy.optimize import minimize
+
+from sumo_cohesion.planning.compiled import BoundCall, compiled
+from sumo_cohesion.planning.problem import Guess, Problem, Solution
+from sumo_cohesion.planning.settings import PlannerSettings
+from sumo_cohesion.planning.stage import (
+    CONTROL_SCALE,
+    TERMS,
+    StageParameters,
+    control_bounds,
+    make_stage,
+    stopping_stage,
+)
+from sumo_cohesion.state import FloatArray
+
+
+class Lbfgs:
+    """Solver for problems of one shape; built once."""
+
+    name = "lbfgs"
+
+    def __init__(self, settings: PlannerSettings, n_lanes: int) -> None:
+        self._settings = settings
+        self._parameters = StageParameters(settings, n_lanes)
+        one = stopping_stage(make_stage(settings, self._parameters), settings)
+        t = settings.horizon
+        ego, u = ca.MX.sym("ego", 4), ca.MX.sym("u", 2, t)
+        p = ca.MX.sym("p", self._parameters.size, t)
+        state, total, states = ego, ca.MX.zeros(len(TERMS)), [ego]
+        for i in range(t):
+            state, _, gained = one(state, u[:, i], p[:, i], -ca.inf, ca.inf)
+            states.append(state)
+            total += gained
+        cost = -ca.sum1(total)
+        function = ca.Function(
+            "cost", [ego, u, p], [cost, ca.gradient(cost, u), ca.horzcat(*states), total]
+        )
+        (function,), self.how = compiled([function])
+        self._ego, self._u, self._p = np.zeros(4), np.zeros((t, 2)), np.zeros((t, p.shape[0]))
+        self._cost, self._gradient = np.zeros(1), np.zeros((t, 2))
+        self._states, self._terms = np.zeros((t + 1, 4)), np.zeros(len(TERMS))
+        outputs = [self._cost, self._gradient, self._states, self._terms]
+        self._run = BoundCall(function, [self._ego, self._u, self._p], outputs)
+
+    def solve(self, problem: Problem, guess: Guess) -> Solution:
+        """Solve from a guess of the controls; the guess of the states is not needed."""
+        start = time.perf_counter()
+        self._parameters.fill(problem, self._p.T)
+        self._ego[:] = problem.ego
+        low, high = control_bounds(self._settings, problem)
+        bounds = list(zip(low.tolist(), high.tolist(), strict=True)) * self._settings.horizon
+        first = np.clip(guess.controls / CONTROL_SCALE, low, high)
+        result = minimize(
+            self._cost_and_gradient,
+            first.ravel(),
+            method="L-BFGS-B",
+            jac=True,
+            bounds=bounds,
+            options={"maxiter": 10 * self._settings.max_iterations},
+        )
+        self._cost_and_gradient(result.x)
+        # A line search that ends at the limits of the arithmetic is no failure.
+        solved = bool(np.isfinite(result.fun)) and result.status in (0, 2)
+        return Solution(
+            states=self._states.copy(),
+            controls=self._u * CONTROL_SCALE,
+            solved=solved,
+            status="solved" if solved else f"{self.name} returned {result.message}",
+            iterations=int(result.nit),
+            wall_time=time.perf_counter() - start,
+            reward=dict(zip(TERMS, self._terms.tolist(), strict=True)),
+        )
+
+    def _cost_and_gradient(self, u: FloatArray) -> tuple[float, FloatArray]:
+        self._u[:] = u.reshape(self._u.shape)
+        self._run()
+        return float(self._cost[0]), self._gradient.ravel().copy()

@@ -1,0 +1,113 @@
+"""Cross-check: CasADi's interior point methods on the same problem, by multiple shooting.
+
+The states and controls of the horizon are the unknowns, the dynamics are equality constraints.
+fatrop uses the structure of the horizon; IPOPT is general, slower and sturdier.
+"""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from sumo_cohesion.planning.problem import Guess, Problem, Solution
+from sumo_cohesion.planning.settings import PlannerSettings
+from sumo_cohesion.planning.stage import (
+    CONTROL_SCALE,
+    TERMS,
+    StageParameters,
+    control_bounds,
+    make_stage,
+)
+from sumo_cohesion.state import FloatArray
+
+
+class InteriorPoint:
+    """Solver for problems of one shape; built once."""
+
+    how = "CasADi's virtual machine"
+
+    def __init__(self, settings: PlannerSettings, n_lanes: int, name: str) -> None:
+        self.name = name
+        self._settings = settings
+        self._parameters = StageParameters(settings, n_lanes)
+        horizon = settings.horizon
+        stage = make_stage(settings, self._parameters)
+        terms = ca.vertcat(*[stage.terms[term] for term in TERMS])
+        inputs = [stage.state, stage.control, stage.parameters]
+        one = ca.Function("stage", inputs, [stage.next_state, terms])
+        ego, p = ca.SX.sym("ego", 4), ca.SX.sym("p", self._parameters.size, horizon)
+        states = [ca.SX.sym(f"x{t}", 4) for t in range(horizon + 1)]
+        controls = [ca.SX.sym(f"u{t}", 2) for t in range(horizon)]
+        unknowns, constraints, total = [], [], ca.SX.zeros(len(TERMS))
+        for t in range(horizon):
+            stepped, gained = one(states[t], controls[t], p[:, t])
+            unknowns += [states[t], controls[t]]
+            constraints.append(states[t + 1] - stepped)
+            if t == 0:
+                constraints.append(states[0] - ego)
+            total += gained
+        unknowns.append(states[horizon])
+        z, g = ca.vertcat(*unknowns), ca.vertcat(*constraints)
+        parameters = ca.vertcat(ego, ca.vec(p))
+        nlp = {"x": z, "p": parameters, "f": -ca.sum1(total), "g": g}
+        self._solver = ca.nlpsol(name, name, nlp, self._options(g.shape[0]))
+        self._terms = ca.Function("terms", [z, parameters], [total])
+
+    def _options(self, n_constraints: int) -> dict[str, Any]:
+        common: dict[str, Any] = {"print_time": False, "error_on_fail": False}
+        iterations = self._settings.max_iterations
+        if self.name == "fatrop":
+            return common | {
+                "structure_detection": "auto",
+                "equality": [True] * n_constraints,
+                "fatrop.print_level": 0,
+                "fatrop.max_iter": iterations,
+            }
+        return common | {"ipopt.print_level": 0, "ipopt.sb": "yes", "ipopt.max_iter": iterations}
+
+    def solve(self, problem: Problem, guess: Guess) -> Solution:
+        """Solve from a guess; never raises for the solver's failure, see ``solved``."""
+        start = time.perf_counter()
+        stages = np.empty((self._settings.horizon, self._parameters.size))
+        self._parameters.fill(problem, stages.T)
+        parameters = np.concatenate((problem.ego, stages.ravel()))
+        lower, upper = self._bounds(problem)
+        x0 = self._pack(guess.states, guess.controls)
+        result = self._solver(x0=x0, p=parameters, lbx=lower, ubx=upper, lbg=0.0, ubg=0.0)
+        stats = self._solver.stats()
+        z = np.asarray(result["x"]).ravel()
+        solved = bool(stats["success"]) and bool(np.isfinite(z.sum()))
+        states, controls = self._unpack(z)
+        values = np.asarray(self._terms(z, parameters)).ravel().tolist() if solved else []
+        return Solution(
+            states=states,
+            controls=controls,
+            solved=solved,
+            status="solved" if solved else f"{self.name} returned {stats['return_status']}",
+            iterations=int(stats["iter_count"]),
+            wall_time=time.perf_counter() - start,
+            reward=dict(zip(TERMS, values, strict=True)) if solved else {},
+        )
+
+    def _bounds(self, problem: Problem) -> tuple[FloatArray, FloatArray]:
+        """Bounds on the unknowns: those of the controls, and no reversing."""
+        t = self._settings.horizon
+        low, high = control_bounds(self._settings, problem)
+        x_low = np.array([-np.inf, -np.inf, -np.inf, 0.0])
+        lower = np.concatenate((np.tile(np.concatenate((x_low, low)), t), x_low))
+        # The present state is given: a bound that it lies on would leave no interior.
+        lower[:4] = -np.inf
+        free = np.full(4, np.inf)
+        upper = np.concatenate((np.tile(np.concatenate((free, high)), t), free))
+        return lower, upper
+
+    def _pack(self, states: FloatArray, controls: FloatArray) -> FloatArray:
+        rows = np.hstack((states[:-1], controls / CONTROL_SCALE))
+        return np.concatenate((rows.ravel(), states[-1]))
+
+    def _unpack(self, z: FloatArray) -> tuple[FloatArray, FloatArray]:
+        rows = z[:-4].reshape(self._settings.horizon, 6)
+        return np.vstack((rows[:, :4], z[-4:])), rows[:, 4:] * CONTROL_SCALE

@@ -1,0 +1,69 @@
+"""One planning problem and its solution: what crosses the border between planner and solvers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from sumo_cohesion.state import FloatArray
+
+FAR_AWAY = 1e4
+"""Metres at which lanes and cars that do not exist are put: their Gaussians are zero there."""
+
+
+@dataclass(frozen=True)
+class Problem:
+    """One instance: what changes from step to step. T stages, L lanes, N cars, k features.
+
+    Attributes
+    ----------
+    ego : (4,) road state.
+    ego_width : (1,) m.
+    road_curvature : (T,) of the reference line (1/m) at the start of each stage.
+    lanes, lane_widths : (L, T) m, at the end of each stage.
+    right, left : (T,) m, edges of the drivable strip.
+    speed_limit : (T,) m/s.
+    cars : (6, N, T), see reward.StageInputs.
+    theta : (6,) weights of the reward terms.
+    cohesion_weight, cohesion_target : (k, T), beta included; zero weights: not cohesive.
+    place_weight, place_target : (T,) per m², beta included, and m: where across the road.
+    """
+
+    ego: FloatArray
+    ego_width: FloatArray
+    road_curvature: FloatArray
+    lanes: FloatArray
+    lane_widths: FloatArray
+    right: FloatArray
+    left: FloatArray
+    speed_limit: FloatArray
+    cars: FloatArray
+    theta: FloatArray
+    cohesion_weight: FloatArray
+    cohesion_target: FloatArray
+    place_weight: FloatArray
+    place_target: FloatArray
+
+
+@dataclass(frozen=True)
+class Guess:
+    """Where a solver starts: states (T + 1, 4), controls (T, 2)."""
+
+    states: FloatArray
+    controls: FloatArray
+
+
+@dataclass(frozen=True)
+class Solution:
+    """What the solver gave: states (T + 1, 4), controls (T, 2), and how it went.
+
+    ``reward`` holds the weighted terms over the horizon, cohesion included; their sum is what was
+    maximised.
+    """
+
+    states: FloatArray
+    controls: FloatArray
+    solved: bool
+    status: str
+    iterations: int
+    wall_time: float
+    reward: dict[str, float]
