@@ -53,8 +53,8 @@ def _find_compiler() -> str | None:
 def _library(functions: Sequence[Any], compiler: str) -> Path:
     """Path of the functions' library, made if it is not there."""
     code = _c_code(functions)
-    stat = Path(compiler).resolve().stat()
-    about = f"{compiler} {stat.st_size} {stat.st_mtime_ns} {OPTIONS} {version('casadi')}\n{code}"
+    stat, casadi = Path(compiler).resolve().stat(), version("casadi")
+    about = f"{compiler} {stat.st_size} {stat.st_mtime_ns} {OPTIONS} {casadi}\n{code}"
     folder = cache_folder()
     folder.mkdir(parents=True, exist_ok=True)
     library = folder / f"{hashlib.sha256(about.encode()).hexdigest()[:32]}.so"
@@ -114,4 +114,5 @@ class BoundCall:
             self._buffer.set_res(i, array.reshape(-1).data)
 
     def __call__(self) -> None:
+        """Read the inputs, write the outputs."""
         self._run()
