@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from math import floor, pi
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -16,6 +17,22 @@ from sumo_cohesion.state import FloatArray, IntArray
 
 SPACING = 1.0
 """Metres between vertices of the reference line."""
+
+
+class RoadAhead(NamedTuple):
+    """The road at n places.
+
+    lanes, widths : (L, n) m; infinitely far and NaN where a lane does not exist.
+    right, left : (n,) m, borders of the paved strip.
+    speed_limit, curvature : (n,) m/s and 1/m.
+    """
+
+    lanes: FloatArray
+    widths: FloatArray
+    right: FloatArray
+    left: FloatArray
+    speed_limit: FloatArray
+    curvature: FloatArray
 
 
 @dataclass(frozen=True)
@@ -55,6 +72,7 @@ class Road:
     _near: dict[tuple[int, int], int] = field(init=False, repr=False, compare=False)
     _centre_or_far: FloatArray = field(init=False, repr=False, compare=False)
     _lane_rows: list[list[float]] = field(init=False, repr=False, compare=False)
+    _strips: FloatArray = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         vertices = np.column_stack((self.x, self.y))
@@ -70,6 +88,7 @@ class Road:
         centre = np.where(np.isnan(self.lane_centre), np.inf, self.lane_centre)
         object.__setattr__(self, "_centre_or_far", centre)
         object.__setattr__(self, "_lane_rows", centre.tolist())
+        object.__setattr__(self, "_strips", _strips(self.lane_centre, self.lane_width))
 
     def index(self, s: ArrayLike) -> IntArray:
         """Vertex nearest to each arc length s (m)."""
@@ -113,17 +132,19 @@ class Road:
         Lanes less than half a metre apart make one strip; an exit that has parted from the
         route is a strip of its own.
         """
+        lane = self.lane_index(s, d)
+        right, left = self._strips[self.index(s), lane].T
+        return right, left
+
+    def ahead(self, s: FloatArray, d: float) -> RoadAhead:
+        """Look the road up at places s (m), (n,), on the strip that holds d (m)."""
         i = self.index(s)
-        centre, half = self.lane_centre[i], self.lane_width[i] / 2
-        right, left = centre - half, centre + half
-        lane = self.lane_index(s, d)[..., None]
-        lower = np.take_along_axis(right, lane, -1)
-        upper = np.take_along_axis(left, lane, -1)
-        for _ in range(centre.shape[-1] - 1):
-            touches = (left > lower - 0.5) & (right < upper + 0.5)
-            lower = np.where(touches, right, np.inf).min(-1, keepdims=True)
-            upper = np.where(touches, left, -np.inf).max(-1, keepdims=True)
-        return lower[..., 0], upper[..., 0]
+        lane = np.abs(self._centre_or_far[i] - d).argmin(axis=1)
+        right, left = self._strips[i, lane].T
+        widths = self.lane_width[i]
+        return RoadAhead(
+            self._centre_or_far[i].T, widths.T, right, left, self.speed_limit[i], self.curvature[i]
+        )
 
     def project(self, x: float, y: float) -> tuple[float, float, float, float]:
         """Road coordinates of one Cartesian point.
@@ -195,6 +216,20 @@ class Road:
             d /= tx * tx + ty * ty
             rows.append((x0 + u * ex - d * ty, y0 + u * ey + d * tx, heading + h0 + u * h1, speed))
         return np.array(rows, dtype=float).reshape(-1, 4)
+
+
+def _strips(centre: FloatArray, width: FloatArray) -> FloatArray:
+    """Right and left border of the strip that each lane is part of: (G, L, 2)."""
+    right, left = centre - width / 2, centre + width / 2
+    lower, upper = right.copy(), left.copy()
+    for _ in range(centre.shape[1] - 1):
+        # (G, L, L): does the strip grown so far touch the other lane?
+        touches = (left[:, None] > lower[:, :, None] - 0.5) & (
+            right[:, None] < upper[:, :, None] + 0.5
+        )
+        lower = np.where(touches, right[:, None], np.inf).min(axis=2)
+        upper = np.where(touches, left[:, None], -np.inf).max(axis=2)
+    return np.stack((lower, upper), axis=2)
 
 
 def wrap_angle(angle: float) -> float:

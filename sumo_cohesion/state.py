@@ -140,6 +140,7 @@ class Plan:
     controls : the T planned controls; the first is driven. Empty: SUMO drives the ego.
     states : (T + 1, 4) predicted road states, the present one first.
     status : "solved", "sumo", or why the plan is a fallback.
+    solver : which one, and whether it is compiled; empty for planners without.
     fallback : True if the solver gave nothing usable and the ego brakes in its lane.
     iterations : solver iterations.
     wall_time, social_time : seconds spent in the solver, and on who, what and when (the runner
@@ -151,6 +152,7 @@ class Plan:
     controls: tuple[Control, ...]
     states: FloatArray
     status: str
+    solver: str = ""
     fallback: bool = False
     iterations: int = 0
     wall_time: float = 0.0

@@ -189,6 +189,7 @@ class Recorder:
             "events": {str(number): time for number, time in ending.triggered.items()},
             "hidden": list(setup.scenario.sensing.hidden),
             "special": list(setup.scenario.sensing.special),
+            "solver": self._plans[0][2].solver if self._plans else "",
             "n_route_lanes": setup.road.n_route_lanes,
             "versions": versions(),
         }

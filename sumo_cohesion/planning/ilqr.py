@@ -22,14 +22,13 @@ import casadi as ca
 import numpy as np
 
 from sumo_cohesion.planning.compiled import BoundCall, compiled
-from sumo_cohesion.planning.problem import Guess, Problem, Solution
+from sumo_cohesion.planning.problem import Guess, Instance, Solution
 from sumo_cohesion.planning.settings import PlannerSettings
 from sumo_cohesion.planning.stage import (
     CONTROL_SCALE,
     TERMS,
     Stage,
     StageParameters,
-    control_bounds,
     make_stage,
     standstill,
     stopping_stage,
@@ -87,10 +86,10 @@ class Ilqr:
             [self._x_new, self._u_new, self._terms],
         )
 
-    def solve(self, problem: Problem, guess: Guess) -> Solution:
+    def solve(self, instance: Instance, guess: Guess) -> Solution:
         """Solve from a guess of the controls; the guess of the states is not needed."""
         start = time.perf_counter()
-        self._load(problem, guess)
+        self._load(instance, guess)
         cost = self._roll_out(0.0)
         if not np.isfinite(cost):
             return self._result("cost is not finite", 0, start, solved=False)
@@ -122,10 +121,9 @@ class Ilqr:
             "too many iterations", self._settings.max_iterations, start, solved=False
         )
 
-    def _load(self, problem: Problem, guess: Guess) -> None:
-        self._parameters.fill(problem, self._p.T)
-        self._low[:], self._high[:] = control_bounds(self._settings, problem)
-        self._x[0] = problem.ego
+    def _load(self, instance: Instance, guess: Guess) -> None:
+        self._p[:], self._x[0] = instance.stages, instance.ego
+        self._low[:], self._high[:] = instance.low, instance.high
         np.clip(guess.controls / CONTROL_SCALE, self._low, self._high, out=self._u)
         self._step[:], self._gain[:] = 0.0, 0.0
 

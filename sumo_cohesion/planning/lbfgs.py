@@ -9,13 +9,12 @@ import numpy as np
 from scipy.optimize import minimize
 
 from sumo_cohesion.planning.compiled import BoundCall, compiled
-from sumo_cohesion.planning.problem import Guess, Problem, Solution
+from sumo_cohesion.planning.problem import Guess, Instance, Solution
 from sumo_cohesion.planning.settings import PlannerSettings
 from sumo_cohesion.planning.stage import (
     CONTROL_SCALE,
     TERMS,
     StageParameters,
-    control_bounds,
     make_stage,
     stopping_stage,
 )
@@ -29,11 +28,11 @@ class Lbfgs:
 
     def __init__(self, settings: PlannerSettings, n_lanes: int) -> None:
         self._settings = settings
-        self._parameters = StageParameters(settings, n_lanes)
-        one = stopping_stage(make_stage(settings, self._parameters), settings)
+        parameters = StageParameters(settings, n_lanes)
+        one = stopping_stage(make_stage(settings, parameters), settings)
         t = settings.horizon
         ego, u = ca.MX.sym("ego", 4), ca.MX.sym("u", 2, t)
-        p = ca.MX.sym("p", self._parameters.size, t)
+        p = ca.MX.sym("p", parameters.size, t)
         state, total, states = ego, ca.MX.zeros(len(TERMS)), [ego]
         for i in range(t):
             state, _, gained = one(state, u[:, i], p[:, i], -ca.inf, ca.inf)
@@ -50,20 +49,18 @@ class Lbfgs:
         outputs = [self._cost, self._gradient, self._states, self._terms]
         self._run = BoundCall(function, [self._ego, self._u, self._p], outputs)
 
-    def solve(self, problem: Problem, guess: Guess) -> Solution:
+    def solve(self, instance: Instance, guess: Guess) -> Solution:
         """Solve from a guess of the controls; the guess of the states is not needed."""
         start = time.perf_counter()
-        self._parameters.fill(problem, self._p.T)
-        self._ego[:] = problem.ego
-        low, high = control_bounds(self._settings, problem)
-        bounds = list(zip(low.tolist(), high.tolist(), strict=True)) * self._settings.horizon
-        first = np.clip(guess.controls / CONTROL_SCALE, low, high)
+        self._p[:], self._ego[:] = instance.stages, instance.ego
+        low, high = instance.low.ravel().tolist(), instance.high.ravel().tolist()
+        first = np.clip(guess.controls / CONTROL_SCALE, instance.low, instance.high)
         result = minimize(
             self._cost_and_gradient,
             first.ravel(),
             method="L-BFGS-B",
             jac=True,
-            bounds=bounds,
+            bounds=list(zip(low, high, strict=True)),
             options={"maxiter": 10 * self._settings.max_iterations},
         )
         self._cost_and_gradient(result.x)

@@ -17,8 +17,9 @@ from sumo_cohesion.planning.dynamics import DT
 from sumo_cohesion.planning.ilqr import Ilqr
 from sumo_cohesion.planning.lbfgs import Lbfgs
 from sumo_cohesion.planning.nlp import InteriorPoint
-from sumo_cohesion.planning.problem import Guess, Problem, Solution
+from sumo_cohesion.planning.problem import Guess, Instance, Problem, Solution
 from sumo_cohesion.planning.settings import PlannerSettings
+from sumo_cohesion.planning.stage import StageParameters, control_bounds
 
 
 class Solver(Protocol):
@@ -27,7 +28,7 @@ class Solver(Protocol):
     name: str
     how: str
 
-    def solve(self, problem: Problem, guess: Guess) -> Solution:
+    def solve(self, instance: Instance, guess: Guess) -> Solution:
         """Solve one instance; a failure is a solution that is not ``solved``."""
 
 
@@ -52,7 +53,15 @@ class Mpc:
         self.n_lanes = n_lanes
         self.solver = SOLVERS[settings.solver](settings, n_lanes)
         self._second: Solver | None = None
+        self._parameters = StageParameters(settings, n_lanes)
+        self._stages = np.zeros((settings.horizon, self._parameters.size))
+        self._low, self._high = np.zeros((2, settings.horizon, 2))
         self._warm: Guess | None = None
+
+    @property
+    def how(self) -> str:
+        """Which solver, and whether it is compiled."""
+        return f"{self.solver.name}, {self.solver.how}"
 
     def reset(self) -> None:
         """Forget the last solution."""
@@ -60,21 +69,24 @@ class Mpc:
 
     def solve(self, problem: Problem) -> Solution:
         """Solve one instance; never raises for a solver's failure, see ``solved``."""
-        if not _is_finite(problem):
+        self._parameters.fill(problem, self._stages)
+        self._low[:], self._high[:] = control_bounds(self.settings, problem.ego)
+        if not np.isfinite(self._stages.sum() + problem.ego.sum()):
             # Some solvers never return from a problem that is not a number.
             empty = np.zeros((0, 0))
             return Solution(empty, empty, False, "input is not finite", 0, 0.0, {})
-        solution = self.solver.solve(problem, self._warm or self._hold(problem))
+        instance = Instance(problem.ego, self._stages, self._low, self._high)
+        solution = self.solver.solve(instance, self._warm or self._hold(problem))
         if not solution.solved:
-            solution = self._rescued(problem, solution)
+            solution = self._rescued(instance, self._hold(problem), solution)
         self._warm = self._shifted(solution) if solution.solved else None
         return solution
 
-    def _rescued(self, problem: Problem, failed: Solution) -> Solution:
+    def _rescued(self, instance: Instance, guess: Guess, failed: Solution) -> Solution:
         """Try IPOPT, slower and sturdier; built when it is first needed."""
         if self._second is None:
             self._second = SOLVERS["ipopt"](self.settings, self.n_lanes)
-        second = self._second.solve(problem, self._hold(problem))
+        second = self._second.solve(instance, guess)
         return replace(
             second,
             status=second.status if second.solved else f"{failed.status}; {second.status}",
@@ -97,12 +109,9 @@ class Mpc:
     def _shifted(self, solution: Solution) -> Guess:
         """Shift a solution by one step in time: the last control is held."""
         states, controls = solution.states, solution.controls
-        last = dynamics.step(states[-1], controls[-1], DT, self.settings.friction)
+        final, held = states[-1].tolist(), controls[-1].tolist()
+        last = dynamics.step(final, held, DT, self.settings.friction)
         return Guess(
             np.concatenate((states[1:], np.array(last)[None])),
             np.concatenate((controls[1:], controls[-1:])),
         )
-
-
-def _is_finite(problem: Problem) -> bool:
-    return all(np.isfinite(part.sum()) for part in vars(problem).values())

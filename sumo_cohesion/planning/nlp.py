@@ -12,13 +12,12 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from sumo_cohesion.planning.problem import Guess, Problem, Solution
+from sumo_cohesion.planning.problem import Guess, Instance, Solution
 from sumo_cohesion.planning.settings import PlannerSettings
 from sumo_cohesion.planning.stage import (
     CONTROL_SCALE,
     TERMS,
     StageParameters,
-    control_bounds,
     make_stage,
 )
 from sumo_cohesion.state import FloatArray
@@ -32,13 +31,13 @@ class InteriorPoint:
     def __init__(self, settings: PlannerSettings, n_lanes: int, name: str) -> None:
         self.name = name
         self._settings = settings
-        self._parameters = StageParameters(settings, n_lanes)
+        layout = StageParameters(settings, n_lanes)
         horizon = settings.horizon
-        stage = make_stage(settings, self._parameters)
+        stage = make_stage(settings, layout)
         terms = ca.vertcat(*[stage.terms[term] for term in TERMS])
         inputs = [stage.state, stage.control, stage.parameters]
         one = ca.Function("stage", inputs, [stage.next_state, terms])
-        ego, p = ca.SX.sym("ego", 4), ca.SX.sym("p", self._parameters.size, horizon)
+        ego, p = ca.SX.sym("ego", 4), ca.SX.sym("p", layout.size, horizon)
         states = [ca.SX.sym(f"x{t}", 4) for t in range(horizon + 1)]
         controls = [ca.SX.sym(f"u{t}", 2) for t in range(horizon)]
         unknowns, constraints, total = [], [], ca.SX.zeros(len(TERMS))
@@ -68,13 +67,11 @@ class InteriorPoint:
             }
         return common | {"ipopt.print_level": 0, "ipopt.sb": "yes", "ipopt.max_iter": iterations}
 
-    def solve(self, problem: Problem, guess: Guess) -> Solution:
+    def solve(self, instance: Instance, guess: Guess) -> Solution:
         """Solve from a guess; never raises for the solver's failure, see ``solved``."""
         start = time.perf_counter()
-        stages = np.empty((self._settings.horizon, self._parameters.size))
-        self._parameters.fill(problem, stages.T)
-        parameters = np.concatenate((problem.ego, stages.ravel()))
-        lower, upper = self._bounds(problem)
+        parameters = np.concatenate((instance.ego, instance.stages.ravel()))
+        lower, upper = self._bounds(instance)
         x0 = self._pack(guess.states, guess.controls)
         result = self._solver(x0=x0, p=parameters, lbx=lower, ubx=upper, lbg=0.0, ubg=0.0)
         stats = self._solver.stats()
@@ -92,17 +89,16 @@ class InteriorPoint:
             reward=dict(zip(TERMS, values, strict=True)) if solved else {},
         )
 
-    def _bounds(self, problem: Problem) -> tuple[FloatArray, FloatArray]:
+    def _bounds(self, instance: Instance) -> tuple[FloatArray, FloatArray]:
         """Bounds on the unknowns: those of the controls, and no reversing."""
-        t = self._settings.horizon
-        low, high = control_bounds(self._settings, problem)
-        x_low = np.array([-np.inf, -np.inf, -np.inf, 0.0])
-        lower = np.concatenate((np.tile(np.concatenate((x_low, low)), t), x_low))
+        horizon, free = self._settings.horizon, np.full(4, np.inf)
+        forwards = np.array([-np.inf, -np.inf, -np.inf, 0.0])
+        rows = np.hstack((np.tile(forwards, (horizon, 1)), instance.low))
+        lower = np.concatenate((rows.ravel(), forwards))
         # The present state is given: a bound that it lies on would leave no interior.
         lower[:4] = -np.inf
-        free = np.full(4, np.inf)
-        upper = np.concatenate((np.tile(np.concatenate((free, high)), t), free))
-        return lower, upper
+        rows = np.hstack((np.tile(free, (horizon, 1)), instance.high))
+        return lower, np.concatenate((rows.ravel(), free))
 
     def _pack(self, states: FloatArray, controls: FloatArray) -> FloatArray:
         rows = np.hstack((states[:-1], controls / CONTROL_SCALE))

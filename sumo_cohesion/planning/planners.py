@@ -95,7 +95,7 @@ class CohesivePlanner:
         solution = self._mpc.solve(self._problem(observation, groups, place))
         # 4. Never without a plan: a failed solve brakes in lane.
         plan = self._to_plan(observation, solution, groups, place)
-        return replace(plan, social_time=social_time)
+        return replace(plan, social_time=social_time, solver=self._mpc.how)
 
     def _agreement(
         self, observation: Observation, history: History
@@ -115,13 +115,12 @@ class CohesivePlanner:
     def _problem(
         self, observation: Observation, groups: tuple[Agreement, ...], place: Place
     ) -> Problem:
-        horizon, road, ego = self.settings.horizon, self._road, observation.ego
+        horizon, ego = self.settings.horizon, observation.ego
         # Where the ego will be if it keeps its speed: the road is looked up there.
-        s = ego.s + DT * ego.speed * np.arange(horizon + 1)
-        lanes = road.lanes_at(s[1:]).T
-        widths = road.lane_width[road.index(s[1:])].T
-        right, left = road.drivable_at(s[1:], np.full(horizon, ego.d))
-        missing = np.isnan(lanes)
+        s: FloatArray = ego.s + DT * ego.speed * np.arange(horizon + 1.0)
+        ahead = self._road.ahead(s, ego.d)
+        lanes, widths = ahead.lanes[:, 1:], ahead.widths[:, 1:]
+        missing = np.isinf(lanes)
         weight = np.zeros((len(FEATURES), horizon))
         target = np.zeros((len(FEATURES), horizon))
         if groups:
@@ -129,24 +128,16 @@ class CohesivePlanner:
             term = combine(groups)
             weight[:, 0] = self.cohesion.beta * np.array(term.weight)
             target[:, 0] = term.target
-        place_weight, place_target = np.zeros((2, horizon))
-        if any(place.weight):
-            stages = np.arange(1, horizon + 1)
-            steps, asked = np.array(self._place_steps), np.array(place.weight)
-            known = asked > 0.0
-            place_weight = np.interp(stages, steps, asked)
-            place_weight *= self.cohesion.beta / PLACE_SCALE**2
-            # Between a known place and an unknown one the known one counts, ever less.
-            place_target = np.interp(stages, steps[known], np.array(place.mean)[known])
+        place_weight, place_target = self._place(place)
         return Problem(
             ego=np.array(ego),
             ego_width=np.array([observation.ego_size[1]]),
-            road_curvature=road.curvature_at(s[:-1]),
+            road_curvature=ahead.curvature[:-1],
             lanes=np.where(missing, FAR_AWAY, lanes),
             lane_widths=np.where(missing, 1.0, widths),
-            right=right,
-            left=left,
-            speed_limit=road.speed_limit_at(s[1:]),
+            right=ahead.right[1:],
+            left=ahead.left[1:],
+            speed_limit=ahead.speed_limit[1:],
             cars=self._predict_cars(observation, FAR_AWAY),
             theta=self._theta,
             cohesion_weight=weight,
@@ -154,6 +145,18 @@ class CohesivePlanner:
             place_weight=place_weight,
             place_target=place_target,
         )
+
+    def _place(self, place: Place) -> tuple[FloatArray, FloatArray]:
+        """Weights and targets of the place across the road, for every stage."""
+        horizon = self.settings.horizon
+        if not any(place.weight):
+            return np.zeros(horizon), np.zeros(horizon)
+        stages = np.arange(1, horizon + 1)
+        steps, asked = np.array(self._place_steps), np.array(place.weight)
+        known = asked > 0.0
+        weight = np.interp(stages, steps, asked) * (self.cohesion.beta / PLACE_SCALE**2)
+        # Between a known place and an unknown one the known one counts, ever less.
+        return weight, np.interp(stages, steps[known], np.array(place.mean)[known])
 
     def _predict_cars(self, observation: Observation, far: float) -> FloatArray:
         """Predict the nearest cars at constant velocity: (6, N, T), see reward.StageInputs."""

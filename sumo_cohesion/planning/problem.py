@@ -45,6 +45,23 @@ class Problem:
 
 
 @dataclass(frozen=True)
+class Instance:
+    """A problem in the solvers' own numbers.
+
+    Attributes
+    ----------
+    ego : (4,) road state.
+    stages : (T, n) parameters of every stage, see stage.StageParameters.
+    low, high : (T, 2) bounds on the scaled controls.
+    """
+
+    ego: FloatArray
+    stages: FloatArray
+    low: FloatArray
+    high: FloatArray
+
+
+@dataclass(frozen=True)
 class Guess:
     """Where a solver starts: states (T + 1, 4), controls (T, 2)."""
 

@@ -76,16 +76,17 @@ class StageParameters:
         return {name: ca.SX.sym(name, size) for name, size in self.sizes.items()}
 
     def fill(self, problem: Problem, out: FloatArray) -> None:
-        """Write a problem's parameters: ``out`` is (size, T), one column per stage."""
-        out[0] = problem.ego_width[0]
+        """Write a problem's parameters: ``out`` is (T, size), one row per stage."""
+        columns = out.T
+        columns[0] = problem.ego_width[0]
         start = 1 + self.sizes["theta"]
-        out[1:start] = problem.theta[:, None]
+        columns[1:start] = problem.theta[:, None]
         for name in list(self.sizes)[2:]:
             end = start + self.sizes[name]
             part = getattr(problem, name)
             if name == "cars":
                 part = part.transpose(1, 0, 2).reshape(self.sizes[name], -1)
-            out[start:end] = part
+            columns[start:end] = part
             start = end
 
 
@@ -127,15 +128,18 @@ def make_stage(settings: PlannerSettings, parameters: StageParameters) -> Stage:
     )
 
 
-def control_bounds(settings: PlannerSettings, problem: Problem) -> tuple[FloatArray, FloatArray]:
-    """Lowest and highest scaled controls of every stage: two arrays (T, 2) or (2,).
+def control_bounds(
+    settings: PlannerSettings, ego: FloatArray
+) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Lowest and highest scaled controls.
 
     Braking and acceleration are bounded as what they do to the speed, friction included.
     """
-    drag = settings.friction * float(problem.ego[3])
-    low = np.array([-settings.max_curvature, drag - settings.max_braking])
-    high = np.array([settings.max_curvature, drag + settings.max_acceleration])
-    return low / CONTROL_SCALE, high / CONTROL_SCALE
+    drag, bend = settings.friction * float(ego[3]), settings.max_curvature
+    curvature, acceleration = CONTROL_SCALE.tolist()
+    low = (-bend / curvature, (drag - settings.max_braking) / acceleration)
+    high = (bend / curvature, (drag + settings.max_acceleration) / acceleration)
+    return low, high
 
 
 def standstill(state: Any, settings: PlannerSettings) -> Any:
