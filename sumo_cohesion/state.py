@@ -142,6 +142,7 @@ class Plan:
     status : "solved", "sumo", or why the plan is a fallback.
     solver : which one, and whether it is compiled; empty for planners without.
     fallback : True if the solver gave nothing usable and the ego brakes in its lane.
+    intervened : True if the last resort (planning.safety) changed the first control.
     iterations : solver iterations.
     wall_time, social_time : seconds spent in the solver, and on who, what and when (the runner
         times the whole call itself).
@@ -154,6 +155,7 @@ class Plan:
     status: str
     solver: str = ""
     fallback: bool = False
+    intervened: bool = False
     iterations: int = 0
     wall_time: float = 0.0
     social_time: float = 0.0

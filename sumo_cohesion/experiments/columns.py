@@ -36,6 +36,7 @@ PLAN = (
     Column("time", "float64", "s", "SUMO time at which the plan was made"),
     Column("status", "string", "", "'solved', 'sumo', or why the plan is a fallback"),
     Column("fallback", "bool", "", "the ego braked in lane because there was no usable plan"),
+    Column("intervened", "bool", "", "the last resort changed the control; the status says why"),
     Column("iterations", "int64", "", "solver iterations"),
     Column("curvature", "float64", "1/m", "driven control; NaN if SUMO drives"),
     Column(
@@ -149,6 +150,7 @@ METRICS = (
     Column("human_mean_speed", "float64", "m/s", "mean over humans that ever moved"),
     Column("human_hard_brakes", "int64", "", "times a human began to brake harder than 4.5 m/s²"),
     Column("plan_failures", "int64", "", "steps driven by the fallback"),
+    Column("interventions", "int64", "", "steps in which the last resort changed the control"),
     Column("plan_ms_median", "float64", "ms", "planner's call, median"),
     Column("plan_ms_p99", "float64", "ms", "planner's call, 99th percentile"),
 )

@@ -66,6 +66,7 @@ def run_metrics(
         "max_lateral_acceleration": max_lateral_acceleration(ego),
         **human_metrics(humans),
         "plan_failures": int(plan["fallback"].sum()),
+        "interventions": int(plan["intervened"].sum()),
         "plan_ms_median": float(timing["plan_ms"].median()),
         "plan_ms_p99": float(timing["plan_ms"].quantile(0.99)),
     }

@@ -239,6 +239,7 @@ class Recorder:
                 "time": time,
                 "status": plan.status,
                 "fallback": plan.fallback,
+                "intervened": plan.intervened,
                 "iterations": plan.iterations,
                 "curvature": control.curvature,
                 "acceleration": control.acceleration,

@@ -24,12 +24,7 @@ def fallback(
 ) -> Plan:
     """Plan without a solver: brake in the lane the ego is in."""
     ego = observation.ego
-    centre = float(road.lanes_at(ego.s)[road.lane_index(ego.s, ego.d)])
-    # Steer so that heading and offset from the lane's centre decay within about a second.
-    reach = max(0.7 * ego.speed, 5.0)
-    bend = -2.0 * ego.heading / reach - (ego.d - centre) / reach**2
-    curvature = float(road.curvature_at(ego.s)) + bend
-    curvature = float(np.clip(curvature, -settings.max_curvature, settings.max_curvature))
+    curvature = keep_lane(observation, road, settings)
     braking = min(BRAKING, ego.speed / DT)
     control = Control(curvature, settings.friction * ego.speed - braking)
     return Plan(
@@ -41,3 +36,13 @@ def fallback(
         wall_time=wall_time,
         agreement=agreement_rows,
     )
+
+
+def keep_lane(observation: Observation, road: Road, settings: PlannerSettings) -> float:
+    """Curvature (1/m) that takes the ego to its lane's centre and along it in about a second."""
+    ego = observation.ego
+    centre = road.nearest_lane(ego.s, ego.d)
+    reach = max(0.7 * ego.speed, 5.0)
+    bend = -2.0 * ego.heading / reach - (ego.d - centre) / reach**2
+    curvature = float(road.curvature_at(ego.s)) + bend
+    return min(max(curvature, -settings.max_curvature), settings.max_curvature)

@@ -20,6 +20,7 @@ from sumo_cohesion.perception.history import History
 from sumo_cohesion.planning.dynamics import DT
 from sumo_cohesion.planning.fallback import fallback
 from sumo_cohesion.planning.problem import FAR_AWAY, Problem, Solution
+from sumo_cohesion.planning.safety import checked
 from sumo_cohesion.planning.settings import PlannerSettings
 from sumo_cohesion.road import Road
 from sumo_cohesion.social.agreement import Agreement, agree, combine
@@ -95,6 +96,9 @@ class CohesivePlanner:
         solution = self._mpc.solve(self._problem(observation, groups, place))
         # 4. Never without a plan: a failed solve brakes in lane.
         plan = self._to_plan(observation, solution, groups, place)
+        # 5. Never a plan without a way out: visible cars come before whatever was agreed.
+        if self.settings.last_resort:
+            plan = checked(plan, observation, self._road, self.settings)
         return replace(plan, social_time=social_time, solver=self._mpc.how)
 
     def _agreement(

@@ -44,6 +44,7 @@ class PlannerSettings(BaseModel):
     cars : how many of the nearest vehicles are avoided.
     solver : ilqr (planning.ilqr), the fast one; fatrop and ipopt, CasADi's interior point methods;
         lbfgs, the paper's own.
+    last_resort : check every plan before it is driven (planning.safety).
     max_iterations : after which a solve has failed. Not a time limit, which would make two
         runs of the same seed differ.
     """
@@ -58,4 +59,5 @@ class PlannerSettings(BaseModel):
     cars: Annotated[int, Field(ge=1, le=100)] = 8
     solver: Literal["ilqr", "fatrop", "ipopt", "lbfgs"] = "ilqr"
     max_iterations: Annotated[int, Field(ge=1)] = 100
+    last_resort: bool = True
     reward: RewardWeights = RewardWeights()

@@ -102,7 +102,7 @@ def test_nominal_alone_keeps_lane_and_limit(highway: Road) -> None:
 
 def test_plan_keeps_its_own_promises(highway: Road) -> None:
     plan = nominal(highway).plan(
-        observation((100.0, 0.4, 0.05, 24.0), [(120.0, 0.0, 0.0, 20.0)]), empty_history()
+        observation((100.0, 0.4, 0.05, 24.0), [(125.0, 0.0, 0.0, 20.0)]), empty_history()
     )
     assert plan.states.shape == (SETTINGS.horizon + 1, 4)
     assert len(plan.controls) == SETTINGS.horizon
