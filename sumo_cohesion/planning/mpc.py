@@ -55,7 +55,6 @@ class Mpc:
         self._second: Solver | None = None
         self._parameters = StageParameters(settings, n_lanes)
         self._stages = np.zeros((settings.horizon, self._parameters.size))
-        self._low, self._high = np.zeros((2, settings.horizon, 2))
         self._warm: Guess | None = None
 
     @property
@@ -70,12 +69,12 @@ class Mpc:
     def solve(self, problem: Problem) -> Solution:
         """Solve one instance; never raises for a solver's failure, see ``solved``."""
         self._parameters.fill(problem, self._stages)
-        self._low[:], self._high[:] = control_bounds(self.settings, problem.ego)
         if not np.isfinite(self._stages.sum() + problem.ego.sum()):
             # Some solvers never return from a problem that is not a number.
             empty = np.zeros((0, 0))
             return Solution(empty, empty, False, "input is not finite", 0, 0.0, {})
-        instance = Instance(problem.ego, self._stages, self._low, self._high)
+        bounds = control_bounds(self.settings, float(problem.ego[3]), problem.last)
+        instance = Instance(problem.ego, self._stages, *bounds)
         solution = self.solver.solve(instance, self._warm or self._hold(problem))
         if not solution.solved:
             solution = self._rescued(instance, self._hold(problem), solution)

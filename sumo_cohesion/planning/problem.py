@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from sumo_cohesion.state import FloatArray
+from sumo_cohesion.state import Control, FloatArray
 
 FAR_AWAY = 1e4
 """Metres at which lanes and cars that do not exist are put: their Gaussians are zero there."""
@@ -26,6 +26,8 @@ class Problem:
     theta : (6,) weights of the reward terms.
     cohesion_weight, cohesion_target : (k, T), beta included; zero weights: not cohesive.
     place_weight, place_target : (T,) per m², beta included, and m: where across the road.
+    constraint_weight : (1,) per m beyond a constraint.
+    last : the control driven last; None at the start.
     """
 
     ego: FloatArray
@@ -42,6 +44,8 @@ class Problem:
     cohesion_target: FloatArray
     place_weight: FloatArray
     place_target: FloatArray
+    constraint_weight: FloatArray
+    last: Control | None = None
 
 
 @dataclass(frozen=True)

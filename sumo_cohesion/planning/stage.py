@@ -11,16 +11,16 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
-from sumo_cohesion.planning import dynamics, reward
+from sumo_cohesion.planning import constraints, dynamics, reward
 from sumo_cohesion.planning.dynamics import DT
 from sumo_cohesion.planning.problem import Problem
 from sumo_cohesion.planning.settings import PlannerSettings, RewardWeights
 from sumo_cohesion.social.features import FEATURES, social_features
-from sumo_cohesion.state import FloatArray
+from sumo_cohesion.state import Control, FloatArray
 
 CONTROL_SCALE = np.array([0.01, 5.0])
 """Curvature (1/m) and acceleration (m/s²) that solvers see as one."""
-TERMS = (*RewardWeights.model_fields, "cohesion")
+TERMS = (*RewardWeights.model_fields, "cohesion", "constraints")
 """Names of the parts of a stage's reward."""
 
 # NumPy's functions on CasADi symbols return CasADi symbols.
@@ -68,6 +68,7 @@ class StageParameters:
             "cohesion_target": k,
             "place_weight": 1,
             "place_target": 1,
+            "constraint_weight": 1,
         }
         self.size = sum(self.sizes.values())
 
@@ -113,8 +114,11 @@ def make_stage(settings: PlannerSettings, parameters: StageParameters) -> Stage:
     psi = ca.vertcat(*social_features(before, after, DT, p["road_curvature"]))
     missed, aside = psi - p["cohesion_target"], after[1] - p["place_target"]
     terms["cohesion"] = -ca.dot(p["cohesion_weight"], missed**2) - p["place_weight"] * aside**2
+    violation = constraints.violations(after, inputs, p["ego_width"])
+    terms["constraints"] = -p["constraint_weight"] * ca.sum1(constraints.penalties(violation))
     rows = reward.squares(after, physical, inputs, p["ego_width"])
     pairs = [(r, theta[name] * w) for name in rows for r, w in rows[name]]
+    pairs.append((violation, p["constraint_weight"] * constraints.penalty_weights(violation)))
     pairs += [(missed, 2.0 * p["cohesion_weight"]), (aside, 2.0 * p["place_weight"])]
     residuals, weights = zip(*pairs, strict=True)
     return Stage(
@@ -129,17 +133,24 @@ def make_stage(settings: PlannerSettings, parameters: StageParameters) -> Stage:
 
 
 def control_bounds(
-    settings: PlannerSettings, ego: FloatArray
-) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Lowest and highest scaled controls.
+    settings: PlannerSettings, speed: float, last: Control | None
+) -> tuple[FloatArray, FloatArray]:
+    """Lowest and highest scaled controls of every stage, (T, 2) each.
 
-    Braking and acceleration are bounded as what they do to the speed, friction included.
+    Braking and acceleration are bounded as what they do to the speed, friction included; the
+    curvature also by the lateral acceleration at the present ``speed`` (m/s). The first control,
+    the only one that is driven, stays near the one driven ``last``.
     """
-    drag, bend = settings.friction * float(ego[3]), settings.max_curvature
-    curvature, acceleration = CONTROL_SCALE.tolist()
-    low = (-bend / curvature, (drag - settings.max_braking) / acceleration)
-    high = (bend / curvature, (drag + settings.max_acceleration) / acceleration)
-    return low, high
+    drag = settings.friction * speed
+    bend = min(settings.max_curvature, settings.max_lateral_acceleration / max(speed, 1.0) ** 2)
+    low = np.tile((-bend, drag - settings.max_braking), (settings.horizon, 1))
+    high = np.tile((bend, drag + settings.max_acceleration), (settings.horizon, 1))
+    if last is not None:
+        change = DT * np.array((settings.max_curvature_rate, settings.max_jerk))
+        # What was driven may lie outside of today's bounds: they come first.
+        near = np.clip(last, low[0], high[0])
+        low[0], high[0] = np.maximum(low[0], near - change), np.minimum(high[0], near + change)
+    return low / CONTROL_SCALE, high / CONTROL_SCALE
 
 
 def standstill(state: Any, settings: PlannerSettings) -> Any:

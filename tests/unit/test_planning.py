@@ -113,7 +113,7 @@ def test_plan_keeps_its_own_promises(highway: Road) -> None:
     assert plan.iterations > 0
     assert plan.wall_time > 0
     assert set(plan.reward) == {
-        "lane", "edge", "speed", "car", "curvature", "acceleration", "cohesion",
+        "lane", "edge", "speed", "car", "curvature", "acceleration", "cohesion", "constraints",
     }  # fmt: skip
     assert plan.reward["cohesion"] == 0.0
 

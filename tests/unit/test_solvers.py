@@ -57,6 +57,7 @@ def problem(seed: int, horizon: int = 10, cohesion: float = 1.0) -> Problem:
         cohesion_target=target,
         place_weight=np.full(t, cohesion * rng.uniform(0.0, 5.0)),
         place_target=rng.uniform(-4.0, 4.0) + np.zeros(t),
+        constraint_weight=np.array([20.0 * (1.0 + weight.sum())]),
     )
 
 
@@ -152,7 +153,7 @@ def test_bounds_hold_whatever_is_asked(
     stops = acceleration * 0.1 <= -solution.states[:-1, 3] * (1.0 - SETTINGS.friction * 0.1) + 1e-6
     assert (acceleration >= drag - SETTINGS.max_braking - 1e-6)[~stops].all()
     assert acceleration.max() <= drag + SETTINGS.max_acceleration + 1e-6
-    assert solution.states[:, 3].min() >= -1e-9
+    assert solution.states[:, 3].min() >= -1e-6  # what IPOPT, which rescues, calls zero
 
 
 def test_a_car_that_has_to_stop_stops(solvers: dict[str, Mpc]) -> None:

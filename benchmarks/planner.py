@@ -1,0 +1,348 @@
+"""The planner beside what a user would build instead, on the same instances, in one run.
+
+    pip install -e '.[benchmark]'
+    python -m benchmarks.planner [--horizons 5,10,20,40] [--instances 100]
+
+The instances are recorded from SUMO scenarios (seeds >= 1000) driven by the cohesive planner. Every
+method solves each of them, one after the other and in turns, cold (from holding speed and lane) and
+warm (from its own last solution, shifted). Times are CPU time of the process, medians and 99th
+percentiles, with everything a method needs per call: its parameters set, its result read. The gap
+counts instances whose reward is more than 1 % (of what there was to gain) below the best known.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import io
+import json
+import os
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pandas as pd
+
+from sumo_cohesion.experiments.rollout import versions
+from sumo_cohesion.experiments.setup import prepare
+from sumo_cohesion.experiments.simulation import simulate
+from sumo_cohesion.planning import mpc as mpc_module
+from sumo_cohesion.planning.mpc import Mpc
+from sumo_cohesion.planning.planners import make_planner
+from sumo_cohesion.planning.problem import Guess, Instance, Problem, Solution
+from sumo_cohesion.planning.settings import PlannerSettings
+from sumo_cohesion.planning.stage import (
+    CONTROL_SCALE,
+    TERMS,
+    StageParameters,
+    make_stage,
+)
+
+HERE = Path(__file__).resolve().parent
+RECORDED = (("stalled_swerve", 1000), ("stalled_dense", 1001), ("ambulance", 1002))
+
+
+def record(horizon: int, n: int) -> list[Problem]:
+    """Problems met in closed loop: stretches of consecutive steps of several scenarios."""
+    problems: list[Problem] = []
+    original = Mpc.solve
+    for scenario, seed in RECORDED:
+        met: list[Problem] = []
+
+        def solve(self: Mpc, problem: Problem, met: list[Problem] = met) -> Solution:
+            met.append(problem)
+            return original(self, problem)
+
+        Mpc.solve = solve  # type: ignore[method-assign]
+        try:
+            setup = prepare(scenario, "cohesive", seed, {"planner.horizon": horizon})
+            simulate(setup, make_planner("cohesive", setup.settings, setup.cohesion))
+        finally:
+            Mpc.solve = original  # type: ignore[method-assign]
+        first = len(met) // 2
+        problems += met[first : first + n // len(RECORDED)]
+    # Bounds on the change of the last control are not something every method can be given.
+    return [replace(problem, last=None) for problem in problems]
+
+
+class Peer:
+    """A peer's model of the same problem: discrete dynamics, our stage cost, bounded controls."""
+
+    def __init__(self, settings: PlannerSettings, n_lanes: int) -> None:
+        self.settings = settings
+        stage = make_stage(settings, StageParameters(settings, n_lanes))
+        inputs = [stage.state, stage.control, stage.parameters]
+        self.step = ca.Function("step", inputs, [stage.next_state])
+        self.cost = ca.Function("cost", inputs, [stage.cost])
+        self.n_parameters = stage.parameters.shape[0]
+
+
+class DoMpc(Peer):
+    """do-mpc, as its documentation has it: a discrete model with time-varying parameters."""
+
+    how = "IPOPT"
+
+    def __init__(self, settings: PlannerSettings, n_lanes: int) -> None:
+        super().__init__(settings, n_lanes)
+        import do_mpc
+
+        model = do_mpc.model.Model("discrete", "SX")
+        x, u = model.set_variable("_x", "x", (4, 1)), model.set_variable("_u", "u", (2, 1))
+        p = model.set_variable("_tvp", "p", (self.n_parameters, 1))
+        model.set_rhs("x", self.step(x, u, p))
+        model.set_expression("cost", self.cost(x, u, p))
+        model.setup()
+        controller = do_mpc.controller.MPC(model)
+        controller.settings.n_horizon = settings.horizon
+        controller.settings.t_step = 0.1
+        controller.settings.store_full_solution = False
+        controller.settings.nlpsol_opts = {
+            "ipopt.print_level": 0,
+            "ipopt.sb": "yes",
+            "print_time": 0,
+            "ipopt.max_iter": settings.max_iterations,
+        }
+        controller.set_objective(mterm=ca.DM(0), lterm=model.aux["cost"])
+        controller.bounds["lower", "_x", "x"] = np.array([[-np.inf, -np.inf, -np.inf, 0.0]]).T
+        self._template = controller.get_tvp_template()
+        controller.set_tvp_fun(lambda _now: self._template)
+        self._controller = controller
+        self._ready = False
+
+    def solve(self, instance: Instance, guess: Guess) -> tuple[np.ndarray, bool]:
+        controller, horizon = self._controller, self.settings.horizon
+        for t in range(horizon + 1):
+            self._template["_tvp", t, "p"] = instance.stages[min(t, horizon - 1)]
+        controller.bounds["lower", "_u", "u"] = instance.low[0]
+        controller.bounds["upper", "_u", "u"] = instance.high[0]
+        if not self._ready:
+            controller.setup()
+            self._ready = True
+        controller.x0 = instance.ego
+        controller.u0 = guess.controls[0] / CONTROL_SCALE
+        controller.set_initial_guess()
+        for t in range(horizon):
+            controller.opt_x_num["_u", t, 0] = (
+                guess.controls[t] / CONTROL_SCALE / controller._u_scaling.cat
+            )
+        for t in range(horizon + 1):
+            controller.opt_x_num["_x", t, 0, -1] = guess.states[t]
+        controller.make_step(instance.ego[:, None])
+        controls = [np.asarray(controller.opt_x_num["_u", t, 0]).ravel() for t in range(horizon)]
+        return np.array(controls), bool(controller.solver_stats["success"])
+
+
+class Rockit(Peer):
+    """rockit: multiple shooting of a discrete-time system with parameters per stage."""
+
+    def __init__(self, settings: PlannerSettings, n_lanes: int, solver: str) -> None:
+        super().__init__(settings, n_lanes)
+        from rockit import MultipleShooting, Ocp
+
+        self.how = solver
+        ocp = Ocp(T=settings.horizon)
+        x, u = ocp.state(4), ocp.control(2)
+        p = ocp.parameter(self.n_parameters, grid="control")
+        low, high, start = ocp.parameter(2), ocp.parameter(2), ocp.parameter(4)
+        ocp.set_next(x, self.step(x, u, p))
+        ocp.add_objective(ocp.sum(self.cost(x, u, p)))
+        ocp.subject_to(low <= (u <= high))
+        ocp.subject_to(ocp.at_t0(x) == start)
+        ocp.subject_to(x[3] >= 0, include_first=False)
+        options: dict[str, Any] = {"print_time": False, "error_on_fail": False}
+        if solver == "fatrop":
+            options |= {"structure_detection": "auto", "fatrop.print_level": 0, "debug": False}
+            options["fatrop.max_iter"] = settings.max_iterations
+        else:
+            options |= {"ipopt.print_level": 0, "ipopt.sb": "yes"}
+            options["ipopt.max_iter"] = settings.max_iterations
+        ocp.solver(solver, options)
+        ocp.method(MultipleShooting(N=settings.horizon, intg="rk"))
+        controls = ocp.sample(u, grid="control-")[1]
+        states = ocp.sample(x, grid="control")[1]
+        self._function = ocp.to_function(
+            "solve", [p, low, high, start, states, controls], [controls]
+        )
+
+    def solve(self, instance: Instance, guess: Guess) -> tuple[np.ndarray, bool]:
+        found = self._function(
+            instance.stages.T,
+            instance.low[0],
+            instance.high[0],
+            instance.ego,
+            guess.states.T,
+            (guess.controls / CONTROL_SCALE).T,
+        )
+        controls = np.asarray(found).T
+        return controls, bool(np.isfinite(controls).all())
+
+
+class Ours:
+    """One of the planner's own solvers."""
+
+    def __init__(self, settings: PlannerSettings, n_lanes: int, name: str) -> None:
+        chosen = settings.model_copy(update={"solver": name})
+        self._solver = mpc_module.SOLVERS[name](chosen, n_lanes)
+        self.how = self._solver.how
+
+    def solve(self, instance: Instance, guess: Guess) -> tuple[np.ndarray, bool]:
+        solution = self._solver.solve(instance, guess)
+        return solution.controls / CONTROL_SCALE, solution.solved
+
+
+@contextlib.contextmanager
+def without_compiler() -> Iterator[None]:
+    """Keep CasADi's virtual machine."""
+    os.environ["SUMO_COHESION_COMPILE"] = "0"
+    try:
+        yield
+    finally:
+        del os.environ["SUMO_COHESION_COMPILE"]
+
+
+def methods(settings: PlannerSettings, n_lanes: int) -> dict[str, Any]:
+    """Everything that is compared, built."""
+    made: dict[str, Callable[[], Any]] = {
+        "ours, compiled": lambda: Ours(settings, n_lanes, "ilqr"),
+        "L-BFGS, compiled": lambda: Ours(settings, n_lanes, "lbfgs"),
+        "CasADi + fatrop": lambda: Ours(settings, n_lanes, "fatrop"),
+        "CasADi + IPOPT": lambda: Ours(settings, n_lanes, "ipopt"),
+        "do-mpc": lambda: DoMpc(settings, n_lanes),
+        "rockit + fatrop": lambda: Rockit(settings, n_lanes, "fatrop"),
+        "rockit + IPOPT": lambda: Rockit(settings, n_lanes, "ipopt"),
+    }
+    built = {}
+    for name, make in made.items():
+        with contextlib.redirect_stdout(io.StringIO()):
+            built[name] = make()
+    with without_compiler():
+        built["ours, no compiler"] = Ours(settings, n_lanes, "ilqr")
+        built["L-BFGS (the paper's)"] = Ours(settings, n_lanes, "lbfgs")
+    return built
+
+
+class Judge:
+    """Says what a plan is worth: the same for every method."""
+
+    def __init__(self, settings: PlannerSettings, n_lanes: int) -> None:
+        stage = make_stage(settings, StageParameters(settings, n_lanes))
+        terms = ca.vertcat(*[stage.terms[name] for name in TERMS])
+        inputs = [stage.state, stage.control, stage.parameters]
+        self._one = ca.Function("one", inputs, [stage.next_state, ca.sum1(terms)])
+
+    def reward(self, instance: Instance, controls: np.ndarray) -> float:
+        x, total = instance.ego, 0.0
+        bounded = np.clip(controls, instance.low, instance.high)
+        for u, p in zip(bounded, instance.stages, strict=True):
+            x, gained = self._one(x, u, p)
+            total += float(gained)
+        return total
+
+
+def compare(horizon: int, n: int) -> pd.DataFrame:
+    settings = PlannerSettings(horizon=horizon)
+    problems = record(horizon, n)
+    n_lanes = max(problem.lanes.shape[0] for problem in problems)
+    problems = [problem for problem in problems if problem.lanes.shape[0] == n_lanes]
+    host = Mpc(settings, n_lanes)
+    instances = []
+    for problem in problems:
+        stages = np.zeros_like(host._stages)
+        host._parameters.fill(problem, stages)
+        bounds = mpc_module.control_bounds(settings, float(problem.ego[3]), None)
+        instances.append(Instance(problem.ego, stages, *bounds))
+    judge, rows = Judge(settings, n_lanes), []
+    built = methods(settings, n_lanes)
+    warm: dict[str, Guess | None] = dict.fromkeys(built)
+    for i, (problem, instance) in enumerate(zip(problems, instances, strict=True)):
+        hold = host._hold(problem)
+        nothing = judge.reward(instance, hold.controls / CONTROL_SCALE)
+        order = list(built)[i % len(built) :] + list(built)[: i % len(built)]
+        for name in order:
+            for start in ("cold", "warm"):
+                guess = hold if start == "cold" else (warm[name] or hold)
+                begin = time.process_time()
+                controls, solved = built[name].solve(instance, guess)
+                took = time.process_time() - begin
+                value = judge.reward(instance, controls) if solved else np.nan
+                rows.append((name, start, i, 1e3 * took, value, nothing, solved))
+            if solved:
+                plan = Solution(
+                    _states(host, problem, controls), controls * CONTROL_SCALE, True, "", 0, 0.0, {}
+                )
+                warm[name] = host._shifted(plan)
+    columns = ["method", "start", "instance", "ms", "reward", "nothing", "solved"]
+    table = pd.DataFrame(rows, columns=columns)
+    table["best"] = table.groupby("instance")["reward"].transform("max")
+    table["gap"] = (table["best"] - table["reward"]) > 0.01 * (table["best"] - table["nothing"])
+    return table.assign(horizon=horizon)
+
+
+def _states(host: Mpc, problem: Problem, controls: np.ndarray) -> np.ndarray:
+    from sumo_cohesion.planning import dynamics
+
+    states = [tuple(problem.ego.tolist())]
+    for u, curvature in zip(controls * CONTROL_SCALE, problem.road_curvature, strict=True):
+        states.append(dynamics.step(states[-1], u, 0.1, host.settings.friction, float(curvature)))
+    return np.array(states, dtype=float)
+
+
+def floor(horizon: int) -> dict[str, float]:
+    """Microseconds of one evaluation of the objective and of one derivative pass, compiled."""
+    solver = mpc_module.Ilqr(PlannerSettings(horizon=horizon), 3)
+    found = {}
+    for name, run in (("objective", solver._run_forward), ("derivatives", solver._run_backward)):
+        times = []
+        for _ in range(2000):
+            begin = time.perf_counter()
+            run()
+            times.append(time.perf_counter() - begin)
+        found[name] = 1e6 * float(np.median(times))
+    return found
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--horizons", default="5,10,20,40")
+    parser.add_argument("--instances", type=int, default=99)
+    given = parser.parse_args()
+    tables = []
+    for horizon in map(int, given.horizons.split(",")):
+        table = compare(horizon, given.instances)
+        tables.append(table)
+        summary = table.groupby(["start", "method"]).agg(
+            median_ms=("ms", "median"),
+            p99_ms=("ms", lambda ms: ms.quantile(0.99)),
+            gap=("gap", "sum"),
+            failed=("solved", lambda solved: (~solved).sum()),
+            n=("ms", "size"),
+        )
+        ours = summary["median_ms"].xs("ours, compiled", level="method")
+        summary["times_ours"] = (
+            summary["median_ms"] / ours.reindex(summary.index.get_level_values("start")).to_numpy()
+        )
+        print(f"\nhorizon {horizon}, floor (µs): {floor(horizon)}")
+        print(summary.round(3).to_string())
+    everything = pd.concat(tables)
+    by = ["horizon", "start", "method"]
+    medians = everything.groupby(by)["ms"].quantile([0.5, 0.99]).unstack()
+    medians.columns = ["median_ms", "p99_ms"]
+    counts = everything.groupby(by).agg(
+        gap=("gap", "sum"), failed=("solved", lambda s: int((~s).sum())), n=("ms", "size")
+    )
+    medians.join(counts).round(4).to_csv(HERE / "planner.csv")
+    about = {
+        "command": f"python -m benchmarks.planner --horizons {given.horizons} "
+        f"--instances {given.instances}",
+        "floor_us": {str(h): floor(int(h)) for h in given.horizons.split(",")},
+        "versions": versions(),
+    }
+    (HERE / "planner.json").write_text(json.dumps(about, indent=2) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
