@@ -79,6 +79,9 @@ def draw_grid(
                 color=EGO_COLOURS.get(str(planner)),
                 label=str(planner),
             )
+        values = table[x].to_numpy(float) if numeric else np.zeros(1)
+        if values.min() > 0.0 and values.max() > 20.0 * values.min():
+            axis.set_xscale("log")
         if not numeric:
             axis.set_xticks(range(len(places)), [str(v) for v in places])
         axis.set_xlabel(x)
