@@ -52,7 +52,7 @@ def result(process: subprocess.Popen[str]) -> tuple[float, float]:
 
 
 class Batched(NamedTuple):
-    """CPU (s) and wall time (s) of a whole batch, start included, and runs per second without it."""
+    """CPU and wall time (s) of a whole batch with its start, and runs per second without it."""
 
     cpu: float
     wall: float
