@@ -5,7 +5,7 @@ NETCONVERT := $(BIN)/netconvert --offset.disable-normalization true --no-turnaro
 # Threads of the linear algebra library only cost time here: the matrices are tiny.
 export OPENBLAS_NUM_THREADS := 1
 
-.PHONY: demo test lint check format networks docs lock wheel benchmark reproduce ablation figures clean
+.PHONY: demo test lint check format networks docs lock wheel benchmark reproduce ablation figures example clean
 
 demo: $(VENV)/.installed
 	$(BIN)/sumo-cohesion compare stalled --seeds 0:8 --out demo
@@ -58,8 +58,13 @@ ablation: $(VENV)/.installed
 figures: $(VENV)/.installed
 	$(BIN)/python analysis/figures.py
 
+# The example of docs/batches.md: about ten minutes.
+example: $(VENV)/.installed
+	$(BIN)/python -m analysis.beta
+
 benchmark: $(VENV)/.installed
 	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python benchmarks/rooms.py | tee benchmarks/rooms.txt
+	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -u -m benchmarks.batch | tee benchmarks/batch.txt
 
 wheel: $(VENV)/.installed
 	$(BIN)/python -m build --wheel

@@ -18,14 +18,14 @@ import sys
 import tempfile
 from pathlib import Path
 from time import perf_counter
-from typing import Any
+from typing import Any, NamedTuple
 
 import sumo_cohesion as sc
 from benchmarks.rooms import write_long_highway
 from sumo_cohesion.batches.batch import Progress
 from sumo_cohesion.experiments.rollout import versions
 
-RUNS = 16
+RUNS = 24
 
 BARE = """
 import json, sys, time
@@ -51,42 +51,53 @@ def result(process: subprocess.Popen[str]) -> tuple[float, float]:
     return float(cpu), float(wall)
 
 
-def batched(scenario: Path, folder: Path, workers: int) -> tuple[float, float]:
-    """CPU and wall time of a whole batch, with the start of its processes."""
+class Batched(NamedTuple):
+    """CPU and wall time (s) of a whole batch with its start, and runs per second without it."""
+
+    cpu: float
+    wall: float
+    rate: float
+
+
+def batched(scenario: Path, folder: Path, workers: int) -> Batched:
     experiment: dict[str, Any] = {
         "scenarios": [str(scenario)],
         "planners": ["cohesive"],
         "seeds": list(range(RUNS)),
         "set": {"duration": 60.0},
     }
-    before = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
-    start = perf_counter()
-    rows = sc.batch(experiment, folder, workers=workers)
-    wall = perf_counter() - start
-    assert (rows["status"] == "done").all()
-    after = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
-    cpu = sum(
-        a.ru_utime + a.ru_stime - b.ru_utime - b.ru_stime
-        for a, b in zip(after, before, strict=True)
+    ends: list[float] = []
+    before, start = _cpu(), perf_counter()
+    rows = sc.batch(
+        experiment, folder, workers=workers, progress=lambda _: ends.append(perf_counter())
     )
-    return cpu, wall
+    wall, cpu = perf_counter() - start, _cpu() - before
+    assert (rows["status"] == "done").all()
+    # From the first result of every worker on: what a long batch tends to.
+    return Batched(cpu, wall, (RUNS - workers) / (ends[-1] - ends[workers - 1]))
+
+
+def _cpu() -> float:
+    """Seconds of CPU of this process and of its children that have ended."""
+    used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    return sum(usage.ru_utime + usage.ru_stime for usage in used)
 
 
 def overhead_and_throughput(folder: Path) -> None:
     scenario = write_long_highway(folder, minutes=1.5)
     cpu, wall = result(bare(scenario, 0, RUNS))
-    print(f"bare loop, one process        {cpu / RUNS:6.2f} s CPU, {wall / RUNS:5.2f} s per run")
-    one_cpu, one_wall = batched(scenario, folder / "one", 1)
-    per_run = f"{one_cpu / RUNS:6.2f} s CPU, {one_wall / RUNS:5.2f} s per run"
-    print(f"batch, one worker             {per_run}")
-    print(f"CPU per run, batch / bare: {one_cpu / cpu:.3f}")
+    print(f"bare loop, one process  {cpu / RUNS:6.2f} s CPU, {wall / RUNS:5.2f} s per run")
+    one = batched(scenario, folder / "one", 1)
+    print(f"batch, one worker       {one.cpu / RUNS:6.2f} s CPU, {one.wall / RUNS:5.2f} s per run")
+    print(f"CPU per run, batch / bare: {one.cpu / cpu:.3f}")
     half = RUNS // 2
     both = [bare(scenario, 0, half), bare(scenario, half, RUNS)]
-    two = max(result(process)[1] for process in both)
-    print(f"two bare loops at once: {wall / two:.2f} times the throughput of one")
-    _, two_wall = batched(scenario, folder / "two", 2)
-    print(f"two workers: {one_wall / two_wall:.2f} times the throughput of one worker")
-    print(f"two workers / two bare loops: {(one_wall / two_wall) / (wall / two):.2f}")
+    machine = wall / max(result(process)[1] for process in both)
+    print(f"two bare loops at once: {machine:.2f} times the throughput of one")
+    two = batched(scenario, folder / "two", 2)
+    print(f"two workers: {two.rate / one.rate:.2f} times the throughput of one worker")
+    print(f"two workers / two bare loops: {two.rate / one.rate / machine:.2f}")
+    print(f"two workers, start of all processes included: {one.wall / two.wall:.2f}")
 
 
 def resident() -> float:

@@ -7,6 +7,7 @@ import math
 import os
 import sys
 import time
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -150,14 +151,22 @@ def run_batch(
     Interrupt it when you like, and run it again to go on.
     """
     from sumo_cohesion.batches import batch as batches
+    from sumo_cohesion.experiments.workers import processors
 
     folder = out if out is not None else Path("results") / experiment.stem
     if dry_run:
         with _clean_stdout():
             plan = batches.dry_run(experiment, folder)
-        _print_plan(plan, folder, workers or os.cpu_count() or 1, as_json=as_json)
+        _print_plan(plan, folder, workers or processors(), as_json=as_json)
         return
-    with _clean_stdout(), _progress(experiment.stem) as progress:
+    failed: Counter[str] = Counter()
+    with _clean_stdout(), _progress(experiment.stem) as show:
+
+        def follow(progress: batches.Progress) -> None:
+            show(progress.done, progress.total, progress.failed)
+            if progress.reason:
+                failed[progress.reason] += 1
+
         rows = batches.batch(
             experiment,
             folder,
@@ -165,11 +174,13 @@ def run_batch(
             dask=dask,
             shard=_parse_shard(shard),
             retry_failed=retry_failed,
-            progress=lambda p: progress(p.done, p.total, p.failed),
+            progress=follow,
         )
-    failed = rows[rows["status"] != "done"].drop_duplicates("run")
-    for reason, runs in failed.groupby("reason", sort=False):
-        click.echo(f"note: {len(runs)} runs have failed: {reason}", err=True)
+    for reason, count in failed.most_common(10):
+        click.echo(f"note: {count} runs have failed now: {reason}", err=True)
+    left = rows[rows["status"] != "done"].drop_duplicates("run")
+    if len(left):
+        click.echo(f"note: {len(left)} runs have no result; see status and reason", err=True)
     if as_json:
         click.echo(json.dumps({"runs": _records(rows)}, ensure_ascii=False))
     else:

@@ -14,3 +14,7 @@ class SimulationError(Exception):
 
 class StorageError(UserError):
     """The disk is full or a folder cannot be written; the message is one line."""
+
+
+class InputsChangedError(UserError):
+    """What decides a run's result is not what it was when the run was planned."""

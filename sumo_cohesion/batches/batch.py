@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
@@ -15,8 +14,13 @@ import pandas as pd
 
 from sumo_cohesion.batches.experiment import Experiment, Work, load_experiment, spell_out
 from sumo_cohesion.batches.job import SUMO, TASK, Job
-from sumo_cohesion.batches.store import DONE, Store, joined
-from sumo_cohesion.errors import SimulationError, StorageError, UserError
+from sumo_cohesion.batches.store import CHANGED, DONE, Store, joined
+from sumo_cohesion.errors import (
+    InputsChangedError,
+    SimulationError,
+    StorageError,
+    UserError,
+)
 from sumo_cohesion.experiments.rollout import versions
 from sumo_cohesion.experiments.setup import prepare
 from sumo_cohesion.experiments.workers import (
@@ -24,17 +28,21 @@ from sumo_cohesion.experiments.workers import (
     Limits,
     Workers,
     call_here,
+    processors,
     search_paths,
     stopped_by_signals,
 )
 
+_WORTH_RETRYING = ("crash", "timeout", "memory")
+
 
 class Progress(NamedTuple):
-    """How far a batch is: runs of this call, and how many of them have failed."""
+    """How far a batch is: runs of this call, how many have failed, and why the last one did."""
 
     done: int
     total: int
     failed: int
+    reason: str = ""
 
 
 @dataclass(frozen=True)
@@ -123,7 +131,7 @@ def dry_run(experiment: str | Path | Mapping[str, Any], out: str | Path) -> pd.D
     finished, times = set(), pd.Series(dtype=float)
     if (folder / "plan.parquet").is_file():
         rows = joined(folder)
-        finished = set(rows["run"])
+        finished = Store(folder, "").finished(_tables(asked))
         times = rows.groupby(["scenario", "planner"])["wall_time"].median().dropna()
     distinct = work.plan.drop_duplicates("run")
     lines = []
@@ -179,17 +187,17 @@ def _check(jobs: list[Job]) -> None:
 
 
 class _Engine(NamedTuple):
-    """Something that does jobs: where to submit them, as what, and how many at once."""
+    """Something that does jobs: where to submit them, as what, and how many to have in hand."""
 
     executor: Executor
     call: Callable[..., Any]
-    at_once: int
+    at_once: Callable[[], int]
 
 
 @contextmanager
 def _engine(asked: Experiment, workers: int | None, dask: str | None) -> Iterator[_Engine]:
     limits = Limits(asked.limits.run_time, asked.limits.memory)
-    count = workers or os.cpu_count() or 1
+    count = workers or processors()
     if dask is not None:
         with _dask_engine(dask, count, limits) as engine:
             yield engine
@@ -197,7 +205,7 @@ def _engine(asked: Experiment, workers: int | None, dask: str | None) -> Iterato
     processes = Workers(TASK, limits)
     executor = ThreadPoolExecutor(count)
     try:
-        yield _Engine(executor, processes.call, count)
+        yield _Engine(executor, processes.call, lambda: count)
     finally:
         processes.close()  # first, so that no thread waits for a run
         executor.shutdown(cancel_futures=True)
@@ -225,15 +233,21 @@ def _dask_engine(address: str, count: int, limits: Limits) -> Iterator[_Engine]:
 
 
 def _over_dask(client: Any, limits: Limits) -> _Engine:
-    threads = sum(client.nthreads().values())
     paths = search_paths()
 
     def call(job: Job) -> Any:
-        return call_here(TASK, limits, paths, job)
+        try:
+            return call_here(TASK, limits, paths, job)
+        except Exception as error:
+            return error  # a run that failed is a result: nothing for Dask to warn of
+
+    def at_once() -> int:
+        # Workers come and go; a few jobs in hand per thread keep them busy.
+        return max(2 * int(sum(client.nthreads().values())), 2)
 
     # Each run is a task of its own, never shared by key: pure=False. Dask does a task again
-    # whose worker was lost; a few in hand per thread keep the workers busy.
-    return _Engine(client.get_executor(pure=False), call, max(2 * threads, 2))
+    # whose worker was lost.
+    return _Engine(client.get_executor(pure=False), call, at_once)
 
 
 def _run(
@@ -251,28 +265,36 @@ def _run(
     def submit(job: Job, attempt: int) -> None:
         waiting[engine.executor.submit(engine.call, job)] = (job, attempt)
 
-    for job in islice(jobs, engine.at_once):
-        submit(job, 1)
+    def fill_up() -> None:
+        for job in islice(jobs, max(engine.at_once() - len(waiting), 0)):
+            submit(job, 1)
+
+    fill_up()
     while waiting:
         for future in wait(waiting, return_when=FIRST_COMPLETED).done:
             job, attempt = waiting.pop(future)
             row = _row(future)
-            if row["status"] not in (DONE, "error") and attempt <= asked.limits.retries:
+            if row["status"] in _WORTH_RETRYING and attempt <= asked.limits.retries:
                 submit(job, attempt + 1)
                 continue
             names = {"run": job.run, "planner": job.planner, "seed": job.seed}
             store.add({**row, **names, "attempts": attempt})
             done, failed = done + 1, failed + (row["status"] != DONE)
             if progress is not None:
-                progress(Progress(done, len(todo), failed))
-            for following in islice(jobs, 1):
-                submit(following, 1)
+                reason = "" if row["status"] == DONE else row["reason"]
+                progress(Progress(done, len(todo), failed, reason))
+        fill_up()
 
 
 def _row(future: Future[Any]) -> dict[str, Any]:
     """Return the row of a run, or one that says why there is none."""
     try:
-        return {"status": DONE, **future.result()}
+        result = future.result()
+        if isinstance(result, Exception):
+            raise result
+        return {"status": DONE, **result}
+    except InputsChangedError as error:
+        return {"status": CHANGED, "reason": str(error)}
     except StorageError:
         raise
     except CallFailedError as error:

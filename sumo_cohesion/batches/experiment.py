@@ -5,24 +5,36 @@ from __future__ import annotations
 import itertools
 import json
 import tomllib
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from math import prod
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import pandas as pd
-from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, field_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    PrivateAttr,
+    StrictInt,
+    field_validator,
+    model_validator,
+)
 
 from sumo_cohesion.batches.identity import point_digest, run_key
 from sumo_cohesion.errors import UserError
 from sumo_cohesion.experiments.scenario import parse_seeds, validated
 from sumo_cohesion.experiments.setup import resolve
-from sumo_cohesion.planning.planners import make_planner
+from sumo_cohesion.planning.planners import check_planner
 from sumo_cohesion.traffic.outputs import Output
 
 Kept = Literal["ego", "trajectory", "plan", "agreement", "timing", "reference"]
 """Tables that can be kept per run; ``ego`` is the ego's part of the trajectory."""
 Value = bool | int | float | str | list[Any]
+MOST_POINTS, MOST_RUNS = 20_000, 5_000_000
+"""Largest experiment: a mistake in a grid should be a line, not a night of silence."""
 
 
 class RunLimits(BaseModel):
@@ -60,7 +72,7 @@ class Experiment(BaseModel):
     summary: str = ""
     scenarios: Annotated[tuple[str, ...], Field(min_length=1)]
     planners: Annotated[tuple[str, ...], Field(min_length=1)] = ("nominal", "cohesive")
-    seeds: tuple[int, ...]
+    seeds: Annotated[tuple[StrictInt, ...], Field(min_length=1)]
     keep: tuple[Kept, ...] = ()
     sumo_outputs: tuple[Output, ...] = ()
     set: dict[str, Any] = {}
@@ -90,8 +102,18 @@ class Experiment(BaseModel):
     @classmethod
     def _no_repeated_values(cls, value: dict[str, list[Value]]) -> dict[str, list[Value]]:
         for values in value.values():
-            _refuse_repeats([json.dumps(v) for v in values])
+            _refuse_repeats([json.dumps(v, default=str) for v in values])
         return value
+
+    @model_validator(mode="after")
+    def _not_too_many(self) -> Experiment:
+        points = len(self.scenarios) * len(self.planners) * prod(map(len, self.grid.values()))
+        if points > MOST_POINTS or points * len(self.seeds) > MOST_RUNS:
+            raise ValueError(
+                f"{points} points and {points * len(self.seeds)} runs are too many for one "
+                f"experiment (at most {MOST_POINTS} and {MOST_RUNS}); make several files"
+            )
+        return self
 
     def points(self) -> Iterator[Point]:
         """Every scenario, planner and grid point, in the order of the file."""
@@ -112,9 +134,9 @@ class Experiment(BaseModel):
 
 
 def _refuse_repeats(values: Sequence[Any]) -> None:
-    for value in values:
-        if list(values).count(value) > 1:
-            raise ValueError(f"{value} is listed twice")
+    value, count = Counter(values).most_common(1)[0] if values else (None, 0)
+    if count > 1:
+        raise ValueError(f"{value} is listed twice")
 
 
 @dataclass(frozen=True)
@@ -182,7 +204,7 @@ def spell_out(experiment: Experiment) -> Work:
     sources: dict[str, str] = {}
     for point in experiment.points():
         inputs = resolve(point.scenario, point.planner, point.overrides)
-        make_planner(point.planner, inputs.settings, inputs.cohesion)
+        check_planner(point.planner)
         name = inputs.scenario.name
         if sources.setdefault(name, point.scenario) != point.scenario:
             raise UserError(
@@ -196,6 +218,12 @@ def spell_out(experiment: Experiment) -> Work:
         head = {"scenario": name, "planner": point.planner, **columns}
         blocks.append({"run": keys, **head, "seed": list(experiment.seeds)})
     plan = pd.concat([pd.DataFrame(block) for block in blocks], ignore_index=True)
+    for name in experiment.grid:
+        kinds = {isinstance(value, str) for value in plan[name]}
+        if len(kinds) > 1:  # numbers and texts: a column of a table holds one or the other
+            plan[name] = plan[name].map(str)
+    if plan.duplicated(["scenario", "planner", *experiment.grid, "seed"]).any():
+        raise UserError("[grid] lists a value twice, written in two ways, such as 1 and 1.0")
     for text in ("run", "scenario", "planner"):
         plan[text] = plan[text].astype("string")
     return Work(plan, points)
@@ -207,7 +235,7 @@ def as_cell(value: Value) -> bool | int | float | str:
     >>> as_cell([2, 5]), as_cell(0.5)
     ('[2, 5]', 0.5)
     """
-    return json.dumps(value) if isinstance(value, list) else value
+    return json.dumps(value, default=str) if isinstance(value, list) else value
 
 
 def flatten(data: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

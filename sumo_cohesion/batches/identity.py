@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import hashlib
 import importlib.util
 import json
@@ -69,15 +70,44 @@ def _file_digest(path: Path, _changed: int, _size: int) -> str:
 
 
 def planner_digest(name: str) -> str:
-    """Digest of the module of a user's own planner; empty for the built-in ones."""
+    """Digest of the code of a user's own planner; empty for the built-in ones.
+
+    Of a planner in a package, the whole package; else its module, and what that imports from its
+    own folder.
+    """
     module, _, class_name = name.partition(":")
     if not class_name:
         return ""
-    loaded = sys.modules.get(module)
-    spec = loaded.__spec__ if loaded is not None else importlib.util.find_spec(module)
-    if spec is None or spec.origin is None or not Path(spec.origin).is_file():
+    top = module.partition(".")[0]
+    loaded = sys.modules.get(top)
+    spec = loaded.__spec__ if loaded is not None else importlib.util.find_spec(top)
+    if spec is None:
         return ""
-    return file_digest(Path(spec.origin))
+    if spec.submodule_search_locations:
+        files = [
+            p for folder in spec.submodule_search_locations for p in Path(folder).rglob("*.py")
+        ]
+    else:
+        files = list(_imported(Path(spec.origin))) if spec.origin else []
+    return _digest(json.dumps(sorted([path.name, file_digest(path)] for path in files)).encode())
+
+
+def _imported(module: Path) -> set[Path]:
+    """Return a module's file, and those beside it that it imports, directly or not."""
+    found: set[Path] = set()
+    left = [module] if module.is_file() else []
+    while left:
+        path = left.pop()
+        found.add(path)
+        for node in ast.walk(ast.parse(path.read_bytes())):
+            names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            if isinstance(node, ast.ImportFrom) and node.module and not node.level:
+                names.append(node.module)
+            for name in names:
+                here = module.parent / name.partition(".")[0]
+                beside = [here.with_suffix(".py"), *here.rglob("*.py")]
+                left += [p for p in beside if p.is_file() and p not in found and p not in left]
+    return found
 
 
 def _digest(data: bytes) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import uuid
 from functools import lru_cache
 from pathlib import Path
 from time import perf_counter
@@ -10,7 +11,7 @@ from typing import Any, NamedTuple
 import pandas as pd
 
 from sumo_cohesion.batches.identity import point_digest, run_key
-from sumo_cohesion.errors import StorageError, UserError
+from sumo_cohesion.errors import InputsChangedError, StorageError
 from sumo_cohesion.experiments.rollout import Rollout
 from sumo_cohesion.experiments.setup import prepare
 from sumo_cohesion.experiments.simulation import simulate_with_outputs
@@ -44,15 +45,17 @@ def drive(job: Job) -> dict[str, Any]:
     Raises
     ------
     UserError, SimulationError
-        As run() does; also if anything that decides the result has changed since the batch
-        was started, or is different on this machine.
+        As run() does.
+    InputsChangedError
+        If anything that decides the result has changed since the batch was started, or is
+        different on this machine.
     """
     start = perf_counter()
     setup = prepare(job.scenario, job.planner, job.seed, job.overrides)
     if run_key(point_digest(setup), job.seed) != job.run:
-        raise UserError(
+        raise InputsChangedError(
             "scenario, network, planner, code or versions are not those the batch was started "
-            "with; start it again, with the same versions on every machine"
+            "with; run it again, with the same versions on every machine"
         )
     outputs: list[Output] = [
         kind for kind in ("fcd", "tripinfo", "ssm") if SUMO + kind in job.tables
@@ -85,11 +88,14 @@ def _keep(rollout: Rollout, name: str, path: Path) -> None:
     else:
         table = getattr(rollout, name)
     table = table.assign(run=pd.Categorical([path.stem] * len(table), [path.stem]))
-    new = path.with_name(f".{path.name}.new")
+    new = path.with_name(f".{path.name}.{uuid.uuid4().hex}.new")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        table.to_parquet(new, index=False)
-        new.replace(path)
+        try:
+            table.to_parquet(new, index=False)
+            new.replace(path)
+        finally:
+            new.unlink(missing_ok=True)
     except OSError as error:
         raise StorageError(
             f"{path.parent}: cannot be written ({error.strerror or error})"

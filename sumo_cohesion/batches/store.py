@@ -17,6 +17,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import uuid
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from types import TracebackType
@@ -32,6 +33,8 @@ MANIFEST = "manifest.json"
 FORMAT = 1
 ROWS_PER_PART = 1000
 DONE = "done"
+CHANGED = "changed"
+"""Status of a run that was not done, because what decides its result was no longer the same."""
 
 _NULLABLE = {"bool": "boolean", "int64": "Int64"}
 _DTYPES = {c.name: c.dtype for c in BATCH} | {
@@ -93,6 +96,7 @@ class Store:
     def finished(self, tables: Iterable[str], *, retry_failed: bool = False) -> set[str]:
         """Keys of the runs that need not be done (again)."""
         rows = _stored(self.folder, ["run", "status"])
+        rows = rows[rows["status"] != CHANGED]
         failed = set(rows.loc[rows["status"] != DONE, "run"])
         done = set(rows["run"]) - failed
         for name in tables:
@@ -127,7 +131,8 @@ class Store:
 
     def join(self) -> None:
         """Write metrics.parquet: what load_metrics gives, for those who read without us."""
-        with storing(self.folder):
+        # Of several shards, the one that writes last must also have read last.
+        with storing(self.folder), _alone(self._runs / ".join.lock"):
             _write_parquet(joined(self.folder), self.folder / "metrics.parquet")
 
 
@@ -142,7 +147,7 @@ def manifest(folder: Path) -> dict[str, Any]:
         about: dict[str, Any] = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise UserError(f"{folder / MANIFEST}: cannot be read ({error})") from None
-    if about.get("format") != FORMAT:
+    if not isinstance(about, dict) or about.get("format") != FORMAT:
         raise UserError(f"{folder}: written by another version of this package")
     return about
 
@@ -164,8 +169,9 @@ def joined(folder: Path) -> pd.DataFrame:
 
 
 def _stored(folder: Path, columns: list[str] | None) -> pd.DataFrame:
-    """All rows in runs/, each run once: the newest."""
-    paths = sorted((folder / "runs").iterdir()) if (folder / "runs").is_dir() else []
+    """All rows in runs/, each run once: the newest that has a result, else the newest."""
+    paths = [p for p in (folder / "runs").glob("*") if not p.name.startswith(".")]
+    paths.sort(key=_changed)
     sealed = {p.stem for p in paths if p.suffix == ".parquet"}
     frames = [
         read_parquet(path, columns) if path.suffix == ".parquet" else _read_journal(path, columns)
@@ -175,19 +181,28 @@ def _stored(folder: Path, columns: list[str] | None) -> pd.DataFrame:
     if not frames:
         frames = [_frame([], columns)]
     rows = pd.concat(frames, ignore_index=True)
+    rows = rows.sort_values("status", key=lambda s: s == DONE, kind="stable")
     return rows.drop_duplicates("run", keep="last")
 
 
+def _changed(path: Path) -> tuple[float, str]:
+    try:
+        return path.stat().st_mtime, path.name
+    except FileNotFoundError:  # a journal that became a part in this moment
+        return float("inf"), path.name
+
+
 def _read_journal(path: Path, columns: list[str] | None) -> pd.DataFrame:
-    return _frame(list(_lines(path)), columns)
+    try:
+        return _frame(list(_lines(path)), columns)
+    except FileNotFoundError:  # it has become a part since the folder was listed
+        part = path.with_suffix(".parquet")
+        return read_parquet(part, columns) if part.exists() else _frame([], columns)
 
 
 def _lines(path: Path) -> Iterator[dict[str, Any]]:
     """Rows of a journal, up to a line that was torn."""
-    try:
-        text = path.read_text(encoding="utf-8", errors="replace")
-    except FileNotFoundError:  # sealed in this moment: its part will be read next time
-        return
+    text = path.read_text(encoding="utf-8", errors="replace")
     for line in text.split("\n")[:-1]:
         try:
             yield json.loads(line)
@@ -226,18 +241,23 @@ def read_parquet(path: Path, columns: list[str] | None = None) -> pd.DataFrame:
 
 
 def _write_parquet(frame: pd.DataFrame, path: Path) -> None:
-    new = path.with_name(f".{path.name}.{os.getpid()}.new")
-    try:
+    with _replacing(path) as new:
         frame.to_parquet(new, index=False)
-        new.replace(path)
-    finally:
-        new.unlink(missing_ok=True)
 
 
 def _write_text(text: str, path: Path) -> None:
-    new = path.with_name(f".{path.name}.{os.getpid()}.new")
-    try:
+    with _replacing(path) as new:
         new.write_text(text, encoding="utf-8")
+
+
+@contextlib.contextmanager
+def _replacing(path: Path) -> Iterator[Path]:
+    """Give a new file to write, which then replaces the old one: whole, or not at all."""
+    new = path.with_name(f".{path.name}.{uuid.uuid4().hex}.new")
+    try:
+        yield new
+        with new.open("rb") as file:
+            os.fsync(file.fileno())
         new.replace(path)
     finally:
         new.unlink(missing_ok=True)
@@ -246,9 +266,9 @@ def _write_text(text: str, path: Path) -> None:
 def _require_ours(folder: Path) -> None:
     if folder.exists() and not folder.is_dir():
         raise UserError(f"{folder}: is a file; choose another --out")
-    if folder.is_dir() and not is_batch(folder) and any(folder.iterdir()):
-        foreign = [p.name for p in folder.iterdir() if p.name not in ("runs", "plan.parquet")]
-        if foreign:
+    if folder.is_dir() and not is_batch(folder):
+        own = ("runs", "plan.parquet")  # of a batch that was killed at once
+        if any(p.name not in own and not p.name.startswith(".") for p in folder.iterdir()):
             raise UserError(f"{folder}: holds something else than a batch; choose another --out")
 
 
@@ -267,6 +287,17 @@ def _locked(path: Path) -> IO[str] | None:
     except OSError:  # a file system without locks
         return file
     return file
+
+
+@contextlib.contextmanager
+def _alone(path: Path) -> Iterator[None]:
+    """Wait until no other process holds this lock."""
+    with path.open("w") as file:
+        with contextlib.suppress(ImportError, OSError):
+            import fcntl
+
+            fcntl.flock(file, fcntl.LOCK_EX)
+        yield
 
 
 class storing:  # noqa: N801 - reads as a function where it is used

@@ -158,7 +158,7 @@ METRICS = (
 
 BATCH = (
     Column("run", "string", "", "key: digest of everything that decides the run's result"),
-    Column("status", "string", "", "done, error, crash, timeout or memory"),
+    Column("status", "string", "", "done, error, crash, timeout, memory or changed"),
     Column("reason", "string", "", "why there is no result, or why the planner failed; or empty"),
     Column("attempts", "int64", "", "how often it was tried"),
     Column("wall_time", "float64", "s", "of the last attempt; NaN if it gave no result"),

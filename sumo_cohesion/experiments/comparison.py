@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
@@ -20,7 +19,7 @@ from sumo_cohesion.experiments.rollout import RUN_FILE, Rollout, require_replace
 from sumo_cohesion.experiments.setup import prepare
 from sumo_cohesion.experiments.simulation import simulate
 from sumo_cohesion.experiments.statistics import summarize
-from sumo_cohesion.experiments.workers import NO_LIMITS, CallFailedError, Workers
+from sumo_cohesion.experiments.workers import NO_LIMITS, CallFailedError, Workers, processors
 from sumo_cohesion.planning.planners import Planner, make_planner
 from sumo_cohesion.planning.settings import PlannerSettings
 from sumo_cohesion.social.settings import CohesionSettings
@@ -157,7 +156,7 @@ def _compared(jobs: Sequence[_Job], results: Sequence[_Result], folder: Path | N
 
 def _run_all(jobs: Sequence[_Job], workers: int | None, progress: Progress | None) -> list[_Result]:
     """Run all jobs; results in the order of the jobs, whatever the number of workers."""
-    count = min(workers or os.cpu_count() or 1, len(jobs))
+    count = min(workers or processors(), len(jobs))
     done: dict[int, _Result] = {}
     for i, result in _results(jobs, count):
         done[i] = result

@@ -123,7 +123,7 @@ class whole_folder:  # noqa: N801 - reads as a function where it is used
 
 def versions() -> dict[str, str]:
     """Versions of everything that can change a result."""
-    packages = ("sumo-cohesion", "libsumo", "casadi", "numpy", "scipy", "pandas")
+    packages = ("sumo-cohesion", "libsumo", "sumolib", "casadi", "numpy", "scipy", "pandas")
     return {"python": platform.python_version()} | {name: version(name) for name in packages}
 
 

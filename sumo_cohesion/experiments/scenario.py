@@ -42,8 +42,8 @@ class Sensing(_Data):
 class Bounds(_Data):
     """A metric lies between ``min`` and ``max``, both included."""
 
-    min: float | None = None
-    max: float | None = None
+    min: Annotated[float, Field(allow_inf_nan=False)] | None = None
+    max: Annotated[float, Field(allow_inf_nan=False)] | None = None
 
     @model_validator(mode="after")
     def _not_empty(self) -> Bounds:
@@ -154,6 +154,8 @@ def load_scenario(source: str | Path, overrides: Mapping[str, Any] | None = None
         raise UserError(f"{path}: cannot be read ({error.strerror})") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise UserError(f"{path}: not valid TOML: {error}") from None
+    except ValueError as error:
+        raise UserError(f"{str(path)!r}: not a file's name ({error})") from None
     scenario = validated(Scenario, merge(data, overrides or {}), str(path))
     scenario._folder = path.parent.resolve()
     return scenario
@@ -221,6 +223,8 @@ def parse_seeds(text: str, what: str = "--seeds") -> list[int]:
     try:
         if ":" in text:
             low, high = (int(part) for part in text.split(":"))
+            if high - low > 1_000_000:
+                raise UserError(f"{what} {text!r}: more than a million seeds; make several parts")
             seeds = list(range(low, high))
         else:
             seeds = [int(part) for part in text.split(",")]

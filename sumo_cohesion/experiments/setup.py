@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 from sumo_cohesion.errors import UserError
 from sumo_cohesion.experiments.scenario import Scenario, load_scenario, settings_from
-from sumo_cohesion.planning.planners import cohesion_of, make_planner
+from sumo_cohesion.planning.planners import check_planner, cohesion_of
 from sumo_cohesion.planning.settings import PlannerSettings
 from sumo_cohesion.road import Road
 from sumo_cohesion.social.settings import CohesionSettings
@@ -109,11 +110,28 @@ def prepare(
         raise UserError(f"seed {seed} is out of range; SUMO takes 0 to 2147483647")
     inputs = resolve(scenario, planner, overrides or {})
     loaded = inputs.scenario
-    make_planner(planner, inputs.settings, inputs.cohesion)
-    network = Network(inputs.network)
+    check_planner(planner)
+    network = _network(inputs.network, *_version(inputs.network))
     named = {*loaded.sensing.hidden, *loaded.sensing.special}
     for event in loaded.events:
         named |= {*event.who} | ({event.near} if event.near else set())
     check_human_type(loaded.human_type)
     route = check_demand(network, inputs.routes, loaded.ego, named)
-    return Setup(**vars(inputs), seed=seed, route=tuple(route), road=network.road(route))
+    road = _road(inputs.network, *_version(inputs.network), tuple(route))
+    return Setup(**vars(inputs), seed=seed, route=tuple(route), road=road)
+
+
+def _version(path: Path) -> tuple[int, int]:
+    """Return when a file was changed and how long it is: if either differs, it is read again."""
+    stat = path.stat()
+    return stat.st_mtime_ns, stat.st_size
+
+
+@lru_cache(maxsize=16)
+def _network(path: Path, _changed: int, _size: int) -> Network:
+    return Network(path)
+
+
+@lru_cache(maxsize=16)
+def _road(path: Path, changed: int, size: int, route: tuple[str, ...]) -> Road:
+    return _network(path, changed, size).road(route)

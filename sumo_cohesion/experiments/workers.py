@@ -13,6 +13,7 @@ import importlib
 import os
 import pickle
 import queue
+import shutil
 import signal
 import struct
 import subprocess
@@ -26,7 +27,7 @@ from pathlib import Path
 from types import FrameType
 from typing import IO, Any, Literal, NamedTuple
 
-from sumo_cohesion.errors import SimulationError, StorageError, UserError
+from sumo_cohesion.errors import InputsChangedError, SimulationError, StorageError, UserError
 
 Kind = Literal["crash", "timeout", "memory", "error"]
 CALLS_PER_PROCESS = 500
@@ -103,11 +104,22 @@ class Workers:
 
     def _take(self) -> _Process:
         with self._lock:
-            if self._idle:
-                return self._idle.pop()
-        process = _Process(self._task, self._limits.memory, self._paths)
-        with self._lock:
+            while self._idle:
+                process = self._idle.pop()
+                if process.is_alive():
+                    return process
+                self._all.discard(process)
+                process.kill()
+            if self._closed:
+                raise CallFailedError("crash", "the workers have been closed")
+            # Known before it is ready, so that close() can end it while it starts.
+            process = _Process(self._task, self._paths)
             self._all.add(process)
+        try:
+            process.wait_until_ready(self._limits.memory)
+        except BaseException:
+            self._drop(process)
+            raise
         return process
 
     def _drop(self, process: _Process) -> None:
@@ -129,7 +141,7 @@ def _value(answer: _Answer, limits: Limits) -> Any:
         return answer.value
     if answer.error == "memory":
         raise CallFailedError("memory", f"needed more than {limits.memory:g} GB of memory")
-    for kind in (StorageError, UserError, SimulationError):
+    for kind in (InputsChangedError, StorageError, UserError, SimulationError):
         if answer.error == kind.__name__:
             raise kind(answer.value)
     raise CallFailedError("error", answer.value)
@@ -156,26 +168,36 @@ def call_here(task: str, limits: Limits, paths: tuple[str, ...], *arguments: Any
 class _Process:
     """One process and the two pipes to it."""
 
-    def __init__(self, task: str, memory: float, paths: Sequence[str]) -> None:
+    def __init__(self, task: str, paths: Sequence[str]) -> None:
         self.calls = 0
+        self._task = task
         # Appended to, so that what was said can be thrown away between calls.
         self._said = tempfile.TemporaryFile("a+b")  # noqa: SIM115 - closed in kill()
+        # What a killed process leaves behind goes with this folder.
+        self._folder = tempfile.mkdtemp(prefix="sumo-cohesion-")
         # The matrices here are tiny: threads of the linear algebra library only fight for cores.
         single = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+        own = {"PYTHONPATH": os.pathsep.join(paths), "TMPDIR": self._folder}
         self._process = subprocess.Popen(
             [sys.executable, "-c", f"from {__name__} import serve; serve()"],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=self._said,
-            env={**single, **os.environ, "PYTHONPATH": os.pathsep.join(paths)},
+            env={**single, **os.environ, **own},
         )
+
+    def wait_until_ready(self, memory: float) -> None:
+        """Wait until the process has imported what it needs: no part of the first call's time."""
         try:
-            _send(self._to, (task, memory))
-            _receive(self._from)  # ready: imports do not count as the first call's time
-        except (OSError, EOFError):
+            _send(self._to, (self._task, memory))
+            _receive(self._from)
+        except (OSError, EOFError, ValueError):  # ValueError: killed by close() meanwhile
             reason = self._last_words() or "it ended at once"
-            self.kill()
             raise SimulationError(f"cannot start a worker process: {reason}") from None
+
+    def is_alive(self) -> bool:
+        """Tell whether the process can take a call."""
+        return self._process.poll() is None
 
     @property
     def _to(self) -> IO[bytes]:
@@ -209,6 +231,8 @@ class _Process:
             raise CallFailedError("crash", self._death()) from None
         finally:
             timer.cancel()
+        if expired.is_set():  # in time, but killed all the same: not to be used again
+            self._process.wait()
         self._said.truncate(0)
         return answer
 
@@ -238,6 +262,7 @@ class _Process:
         for pipe in (self._to, self._from, self._said):
             with contextlib.suppress(OSError):
                 pipe.close()
+        shutil.rmtree(self._folder, ignore_errors=True)
 
 
 def _send(pipe: IO[bytes], message: Any) -> None:
@@ -262,7 +287,8 @@ def serve() -> None:
     """Answer calls until the other side closes its pipe: the process's whole life."""
     calls, answers = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # what native libraries print must not mix with the answers
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
+    for number in (signal.SIGINT, signal.SIGTERM):  # Ctrl-C and the like are the parent's to handle
+        signal.signal(number, signal.SIG_IGN)
     task, memory = _receive(calls)
     _limit_memory(memory)
     module, _, name = task.partition(":")
@@ -306,7 +332,8 @@ def _described(error: Exception) -> str:
     """One line: the exception, and where in the code it was raised."""
     frames = traceback.extract_tb(error.__traceback__)
     where = f" ({Path(frames[-1].filename).name}:{frames[-1].lineno})" if frames else ""
-    return f"{type(error).__name__}: {error}{where}"
+    text = f"{type(error).__name__}: {error}{where}"
+    return text.encode("utf-8", "replace").decode()  # file names need not be text
 
 
 def _limit_memory(gigabytes: float) -> None:
@@ -323,12 +350,19 @@ def _limit_memory(gigabytes: float) -> None:
 
 def _peak_memory() -> float:
     """GB of memory that this process has held at most; 0 where the system does not say."""
-    with contextlib.suppress(ImportError):
-        import resource
-
-        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-        return peak / (1e9 if sys.platform == "darwin" else 1e6)
+    with contextlib.suppress(OSError):
+        # Not getrusage: its peak begins with that of the process that started this one.
+        status = Path("/proc/self/status").read_text()
+        return int(status.partition("VmHWM:")[2].split()[0]) / 1e6
     return 0.0
+
+
+def processors() -> int:
+    """Processors that this process may use: a batch system gives fewer than there are."""
+    try:
+        return len(os.sched_getaffinity(0))
+    except AttributeError:  # macOS, Windows
+        return os.cpu_count() or 1
 
 
 class stopped_by_signals:  # noqa: N801 - reads as a function where it is used

@@ -9,6 +9,7 @@ from __future__ import annotations
 import importlib
 import sys
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Protocol, runtime_checkable
@@ -287,9 +288,16 @@ def make_planner(name: str, settings: PlannerSettings, cohesion: CohesionSetting
     return _load_planner(name)
 
 
+@lru_cache(maxsize=32)
+def check_planner(name: str) -> None:
+    """Raise UserError unless there is such a planner; a user's own is made once to see."""
+    if name not in BUILT_IN:
+        _load_planner(name)
+
+
 def _load_planner(name: str) -> Planner:
     module_name, _, class_name = name.partition(":")
-    if not class_name:
+    if not (module_name and class_name):
         raise UserError(
             f"unknown planner {name!r}; choose {', '.join(BUILT_IN)} or your own as module:Class"
         )
@@ -298,14 +306,18 @@ def _load_planner(name: str) -> Planner:
     if here not in sys.path:
         sys.path.insert(0, here)
     try:
-        planner = getattr(importlib.import_module(module_name), class_name)()
-    except ImportError as error:
-        raise UserError(f"planner {name!r}: cannot import {module_name!r} ({error})") from None
-    except AttributeError:
-        raise UserError(f"planner {name!r}: {module_name!r} has no {class_name!r}") from None
-    except TypeError as error:
+        module = importlib.import_module(module_name)
+    except (Exception, SystemExit) as error:
+        said = str(error) if isinstance(error, ImportError) else f"{type(error).__name__}: {error}"
+        raise UserError(f"planner {name!r}: cannot import {module_name!r} ({said})") from None
+    if not hasattr(module, class_name):
+        raise UserError(f"planner {name!r}: {module_name!r} has no {class_name!r}")
+    try:
+        planner = getattr(module, class_name)()
+    except (Exception, SystemExit) as error:
+        said = f"{type(error).__name__}: {error}"
         raise UserError(
-            f"planner {name!r}: the class must be callable without arguments ({error})"
+            f"planner {name!r}: the class must be callable without arguments ({said})"
         ) from None
     if not isinstance(planner, Planner):
         raise UserError(

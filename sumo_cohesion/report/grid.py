@@ -25,7 +25,9 @@ def intervals(metrics: pd.DataFrame, metric: str, over: list[str]) -> pd.DataFra
     if not rate and not pd.api.types.is_numeric_dtype(metrics[metric].dtype):
         raise UserError(f"{metric} is text; name a metric that is a number or true or false")
     rows = []
-    for names, runs in metrics.groupby(over, sort=False):
+    for names, part in metrics.groupby(over, sort=False):
+        # Rows that share a run are one measurement.
+        runs = part.drop_duplicates("run") if "run" in part.columns else part
         values = runs[metric].dropna()
         if rate and len(values):
             found = wilson(int(values.sum()), len(values))
@@ -47,6 +49,8 @@ def draw_grid(
     Returns the picture's path.
     """
     over = ["planner", x, *([panels] if panels else [])]
+    if len(set(over)) < len(over):
+        raise UserError("the axes are the grid's: neither the planner nor one name twice")
     table = intervals(metrics, metric, over)
     if table.empty:
         raise UserError("no runs to draw")
@@ -75,6 +79,9 @@ def draw_grid(
                 color=EGO_COLOURS.get(str(planner)),
                 label=str(planner),
             )
+        values = table[x].to_numpy(float) if numeric else np.zeros(1)
+        if values.min() > 0.0 and values.max() > 20.0 * values.min():
+            axis.set_xscale("log")
         if not numeric:
             axis.set_xticks(range(len(places)), [str(v) for v in places])
         axis.set_xlabel(x)

@@ -53,3 +53,13 @@ class Raises(Good):
 class RaisesAtOnce(Good):
     def reset(self, road: Road) -> None:
         raise ValueError("no such road")
+
+
+class RaisesNonsense(Good):
+    def reset(self, road: Road) -> None:
+        raise ValueError("bad file \udc80")
+
+
+class CannotBeMade(Good):
+    def __init__(self) -> None:
+        raise ValueError("no")

@@ -20,6 +20,7 @@ import pytest
 
 from sumo_cohesion import Rollout, UserError, batch, load_metrics, load_trajectories, run
 from sumo_cohesion.batches.batch import Progress, dry_run
+from sumo_cohesion.batches.experiment import load_experiment, spell_out
 from sumo_cohesion.batches.store import NOT_REPEATABLE
 
 REPOSITORY = Path(__file__).resolve().parent.parent.parent
@@ -177,7 +178,8 @@ def test_bad_planners_are_rows_with_reasons_among_good_runs(tmp_path: Path) -> N
     assert counted == []
     only = experiment | {"planners": [FAULTY + "RaisesAtOnce"]}
     batch(only, tmp_path / "out", workers=2, retry_failed=True, progress=counted.append)
-    assert counted[-1] == Progress(2, 2, 2)
+    assert counted[-1][:3] == (2, 2, 2)
+    assert "no such road" in counted[-1].reason
 
 
 def test_a_dask_cluster_that_loses_a_worker_gives_the_same_rows(
@@ -270,12 +272,125 @@ def test_a_network_that_changes_while_it_runs_stops_no_run_from_being_true(tmp_p
 
     def change(progress: Progress) -> None:
         if progress.done == 1:
-            network.write_text(network.read_text().replace('speed="25.00"', 'speed="15.00"'))
+            network.write_text(network.read_text().replace('speed="25.00"', 'speed="35.00"'))
 
     rows = batch(experiment, tmp_path / "out", workers=1, progress=change)
-    late = rows[rows["status"] == "error"]
+    late = rows[rows["status"] == "changed"]
     assert 1 <= len(late) < 4
     assert late["reason"].str.contains("not those the batch was started with").all()
+    # Changed back, they are done: they are no failures of their own.
+    network.write_text(network.read_text().replace('speed="35.00"', 'speed="25.00"'))
+    assert (batch(experiment, tmp_path / "out", workers=1)["status"] == "done").all()
+
+
+def test_a_planners_own_code_decides_which_run_it_is(tmp_path: Path) -> None:
+    """A package, and a module with a helper beside it: a change in either makes new runs."""
+    (tmp_path / "own_package").mkdir()
+    (tmp_path / "own_package" / "__init__.py").write_text("from .impl import Mine\n")
+    (tmp_path / "own_module.py").write_text("from own_helper import Mine\n")
+    code = (
+        "from sumo_cohesion.state import Control, Plan\n"
+        "class Mine:\n"
+        "    def reset(self, road): pass\n"
+        "    def plan(self, observation, history):\n"
+        "        return Plan((Control(0.0, 0.5),), [], 'solved')\n"
+    )
+    run_keys = []
+    for version in (code, code.replace("0.5", "0.9")):
+        (tmp_path / "own_package" / "impl.py").write_text(version)
+        (tmp_path / "own_helper.py").write_text(version)
+        script = (
+            "from sumo_cohesion.batches.experiment import load_experiment, spell_out\n"
+            "e = load_experiment(dict(scenarios=['stalled'], seeds=[0],"
+            " planners=['own_package:Mine', 'own_module:Mine']))\n"
+            "print(*spell_out(e).plan['run'])\n"
+        )
+        done = subprocess.run(
+            [sys.executable, "-c", script],
+            cwd=tmp_path,
+            env={**os.environ, "PYTHONPATH": str(REPOSITORY)},
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        run_keys.append(done.stdout.split())
+    assert len({key for keys in run_keys for key in keys}) == 4
+
+
+def test_what_was_retried_with_success_is_done_whoever_failed_first(tmp_path: Path) -> None:
+    small = SHORT | {"scenarios": ["stalled"], "planners": ["sumo"], "grid": {}, "seeds": [0, 1]}
+    out = tmp_path / "out"
+    whole = batch(small, out, workers=1)
+    # As if a shard, whose file is the last by name, had failed to do them before.
+    part = out / "runs" / "1of1-00001.parquet"
+    failed = pd.read_parquet(part).assign(status="crash", reason="lost")
+    failed.to_parquet(out / "runs" / "2of2-00001.parquet", index=False)
+    pd.testing.assert_frame_equal(load_metrics(out), whole)
+
+
+def test_an_interrupt_while_workers_start_does_not_wait_for_a_run(tmp_path: Path) -> None:
+    small = SHORT | {"scenarios": ["stalled"], "planners": [FAULTY + "Endless"], "grid": {}}
+    file, out = toml(small, tmp_path / "short.toml"), tmp_path / "out"
+    environment = {**os.environ, "TMPDIR": str(tmp_path)}
+    process = subprocess.Popen(
+        command(file, out, "--workers", "1"), cwd=REPOSITORY, env=environment, text=True
+    )
+    started: list[Path] = []
+    for _ in range(600):
+        started = list(tmp_path.glob("sumo-cohesion-*"))
+        if started:
+            break
+        time.sleep(0.05)
+    assert started
+    process.send_signal(signal.SIGTERM)
+    assert process.wait(timeout=15) == 1
+    assert not list(tmp_path.glob("sumo-cohesion-*"))  # nor does it leave anything behind
+
+
+def test_a_reason_that_is_no_text_does_not_spoil_the_batch(tmp_path: Path) -> None:
+    experiment = SHORT | {"scenarios": ["stalled"], "planners": [FAULTY + "RaisesNonsense"]}
+    rows = batch(experiment | {"grid": {}, "seeds": [0]}, tmp_path / "out", workers=1)
+    assert rows["reason"].str.startswith("ValueError: bad file ?").all()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"seeds": []}, "at least 1 item"),
+        ({"seeds": [True, 0.0]}, "valid integer"),
+        ({"seeds": "0:1000000000"}, "more than a million seeds"),
+        ({"seeds": [3, 3]}, "3 is listed twice"),
+        ({"scenarios": []}, "at least 1 item"),
+        ({"scenarios": ["stahled"]}, "did you mean 'stalled'"),
+        ({"scenarios": ["a\0.toml"]}, "not a file's name"),
+        ({"grid": {"cohesion.beta": []}}, "at least 1 item"),
+        ({"grid": {"cohesion.beta": [0.1, 0.1]}}, "0.1 is listed twice"),
+        ({"grid": {"cohesion.beta": [1, 1.0]}}, "lists a value twice"),
+        ({"grid": {"cohesion.bta": [1]}}, "did you mean 'beta'"),
+        ({"grid": {"cohesion.beta": [float("nan")]}}, "finite"),
+        ({"grid": {"duration": [2.0]}}, "both in \\[set\\] and in \\[grid\\]"),
+        ({"grid": {"cohesion.beta": [i / 1e6 for i in range(20_001)]}}, "too many"),
+        ({"planners": ["nominl"]}, "unknown planner 'nominl'"),
+        ({"planners": [FAULTY + "NoSuch"]}, "has no 'NoSuch'"),
+        ({"planners": [FAULTY + "CannotBeMade"]}, "callable without arguments"),
+        ({"planners": ["tests.scenarios.exits:Planner"]}, "cannot import"),
+        ({"keep": ["everything"]}, "keep"),
+        ({"colour": 1}, "unknown key 'colour'"),
+    ],
+)
+def test_a_mistake_in_an_experiment_is_one_line(
+    change: dict[str, Any], message: str, tmp_path: Path
+) -> None:
+    with pytest.raises(UserError, match=message) as error:
+        batch(SHORT | change, tmp_path / "out")
+    assert "\n" not in str(error.value)
+    assert not (tmp_path / "out" / "manifest.json").exists()
+
+
+def test_numbers_and_texts_on_one_axis_make_a_column_of_texts() -> None:
+    mixed = SHORT | {"grid": {"human_type.speedFactor": [1.1, "normc(1,0.1,0.2,2)"]}}
+    plan = spell_out(load_experiment(mixed)).plan
+    assert set(plan["human_type.speedFactor"]) == {"1.1", "normc(1,0.1,0.2,2)"}
 
 
 def test_kept_tables_are_found_by_what_they_are_of(tmp_path: Path) -> None:

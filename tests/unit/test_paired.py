@@ -115,6 +115,11 @@ def test_a_metric_over_a_grid_has_intervals_and_a_picture(tmp_path: object) -> N
     cohesive = found[found["planner"] == "cohesive"]
     assert cohesive["value"].tolist() == [0.2, 0.8]
     assert cohesive["low"].tolist() == pytest.approx([0.0567, 0.4902], abs=1e-3)
+    # A run that several rows share is one measurement.
+    shared = pd.concat([table.assign(run=[*range(40)])] * 3)
+    assert intervals(shared, "success", ["planner", "humans"])["n"].tolist() == [20, 20]
+    with pytest.raises(UserError, match="neither the planner nor one name twice"):
+        draw_grid(table, "success", "humans", "humans", f"{tmp_path}/grid.png")
     for x, panels in (("cohesion.beta", "humans"), ("humans", None)):
         picture = draw_grid(table, "success", x, panels, f"{tmp_path}/grid.png")
         assert picture.stat().st_size > 5000
