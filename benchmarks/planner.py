@@ -19,7 +19,6 @@ import json
 import os
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -65,8 +64,7 @@ def record(horizon: int, n: int) -> list[Problem]:
             Mpc.solve = original  # type: ignore[method-assign]
         first = len(met) // 2
         problems += met[first : first + n // len(RECORDED)]
-    # Bounds on the change of the last control are not something every method can be given.
-    return [replace(problem, last=None) for problem in problems]
+    return problems
 
 
 class Peer:
@@ -253,7 +251,7 @@ def compare(horizon: int, n: int) -> pd.DataFrame:
     for problem in problems:
         stages = np.zeros_like(host._stages)
         host._parameters.fill(problem, stages)
-        bounds = mpc_module.control_bounds(settings, float(problem.ego[3]), None)
+        bounds = mpc_module.control_bounds(settings, float(problem.ego[3]))
         instances.append(Instance(problem.ego, stages, *bounds))
     judge, rows = Judge(settings, n_lanes), []
     built = methods(settings, n_lanes)

@@ -115,8 +115,7 @@ def batch(
             raise SimulationError(
                 f"interrupted with {left} of {len(todo)} runs left; run it again to go on"
             ) from None
-    store.join()
-    return joined(folder)
+        return store.join()
 
 
 def dry_run(experiment: str | Path | Mapping[str, Any], out: str | Path) -> pd.DataFrame:

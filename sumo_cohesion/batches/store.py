@@ -129,11 +129,14 @@ class Store:
             journal.close()
         _seal(Path(journal.name))
 
-    def join(self) -> None:
+    def join(self) -> pd.DataFrame:
         """Write metrics.parquet: what load_metrics gives, for those who read without us."""
         # Of several shards, the one that writes last must also have read last.
         with storing(self.folder), _alone(self._runs / ".join.lock"):
-            _write_parquet(joined(self.folder), self.folder / "metrics.parquet")
+            self._close_journal()
+            table = joined(self.folder)
+            _write_parquet(table, self.folder / "metrics.parquet")
+        return table
 
 
 def is_batch(folder: Path) -> bool:

@@ -53,7 +53,7 @@ PLAN = (
     Column("reward_curvature", "float64", "", "reward term over the horizon, weighted"),
     Column("reward_acceleration", "float64", "", "reward term over the horizon, weighted"),
     Column("reward_cohesion", "float64", "", "cohesion term, beta included"),
-    Column("reward_constraints", "float64", "", "penalties for being beyond a constraint"),
+    Column("reward_constraints", "float64", "", "penalties for being too close to a visible car"),
 )
 
 AGREEMENT = (

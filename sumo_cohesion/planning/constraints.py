@@ -1,9 +1,9 @@
-"""What no plan may do for any reward: leave the road, come too close to a visible car.
+"""What no plan may do for any reward: come too close to a visible car.
 
-Exact penalties: beyond its limit a constraint costs in proportion to how far (not to its square),
-and more per metre than anything the plan could win there, cohesion included. So a plan keeps to them
+An exact penalty: beyond the limit it costs in proportion to how far (not to its square), and more
+per metre than anything the plan could win there, cohesion included. So a plan keeps to the limit
 where it can, and where it cannot, as when it starts beyond, the problem still has a solution.
-Bounds on the controls are no penalties: the solvers keep to them exactly (stage.control_bounds).
+Bounds on the controls are no penalties: solvers keep to them exactly (stage.control_bounds).
 """
 
 from __future__ import annotations
@@ -14,29 +14,24 @@ import casadi as ca
 
 from sumo_cohesion.planning.reward import StageInputs
 
-SIDE_TO_EDGE = 0.0
-"""Metres that the ego's side keeps from the road's edge."""
 CORNERS = 2.0**0.25
 """Size of the superellipse of fourth order that holds a box, relative to the box."""
 _SMOOTH = 0.05
 """Metres over which the penalty's slope grows from zero, so that it has a gradient everywhere."""
 
 
-def violations(state: Any, inputs: StageInputs, ego_width: Any) -> Any:
-    """How far (m) a state is beyond each constraint, one column; negative within.
+def violations(state: Any, inputs: StageInputs) -> Any:
+    """How far (m) a state is within every car's surroundings, a column; negative outside.
 
-    Both edges of the drivable strip, then every car: a superellipse around the two boxes put
-    together, measured across the car.
+    They are a superellipse around the two boxes put together; metres are measured across the car.
     """
-    reach = ego_width / 2 + SIDE_TO_EDGE
-    right, left = inputs.right + reach - state[1], state[1] + reach - inputs.left
     cars = inputs.cars
     ds, dd = state[0] - cars[0, :], state[1] - cars[1, :]
     cos, sin, half_length, half_width = cars[2, :], cars[3, :], cars[4, :], cars[5, :]
     along = (ds * cos + dd * sin) / half_length
     across = (dd * cos - ds * sin) / half_width
     distance = (along**4 + across**4 + 1e-6) ** 0.25
-    return ca.vertcat(right, left, ((CORNERS - distance) * half_width).T)
+    return ((CORNERS - distance) * half_width).T
 
 
 def penalties(violation: Any) -> Any:

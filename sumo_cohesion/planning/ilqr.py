@@ -36,6 +36,8 @@ from sumo_cohesion.planning.stage import (
 
 TOLERANCE = 1e-7
 """Relative decrease of the cost at which an iteration is the last one."""
+_ROUNDING = 1e-4
+"""Relative decrease that may be promised in vain at the end."""
 _LEAST_CURVATURE = 1e-8
 _SHORTEST_STEP = 0.01
 _SHORTEN = 0.4
@@ -116,7 +118,10 @@ class Ilqr:
             else:
                 mu = max(100.0 * mu, _REGULARISATION[1])
                 if mu > _REGULARISATION[2]:
-                    return self._result("no step lowers the cost", iteration, start, solved=False)
+                    # As good as it gets in this arithmetic, unless much was promised.
+                    good = promised < _ROUNDING * (1.0 + abs(cost))
+                    status = "solved" if good else "no step lowers the cost"
+                    return self._result(status, iteration, start, solved=good)
         return self._result(
             "too many iterations", self._settings.max_iterations, start, solved=False
         )

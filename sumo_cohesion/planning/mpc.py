@@ -73,7 +73,7 @@ class Mpc:
             # Some solvers never return from a problem that is not a number.
             empty = np.zeros((0, 0))
             return Solution(empty, empty, False, "input is not finite", 0, 0.0, {})
-        bounds = control_bounds(self.settings, float(problem.ego[3]), problem.last)
+        bounds = control_bounds(self.settings, float(problem.ego[3]))
         instance = Instance(problem.ego, self._stages, *bounds)
         solution = self.solver.solve(instance, self._warm or self._hold(problem))
         if not solution.solved:

@@ -71,7 +71,6 @@ class CohesivePlanner:
         self._theta = np.array(list(settings.reward.model_dump().values()))
         self._election = Election(cohesion)
         self._mpc: Mpc | None = None
-        self._last: Control | None = None
         # Where the horizon is asked for the others' place: every third step is dense enough.
         self._place_steps = list(range(1, settings.horizon + 1, 3))
 
@@ -84,7 +83,6 @@ class CohesivePlanner:
         if self._mpc is None or self._mpc.n_lanes != n_lanes:
             self._mpc = Mpc(self.settings, n_lanes)
         self._mpc.reset()
-        self._last = None
         self._election.reset()
 
     def plan(self, observation: Observation, history: History) -> Plan:
@@ -102,7 +100,6 @@ class CohesivePlanner:
         # 5. Never a plan without a way out: visible cars come before whatever was agreed.
         if self.settings.last_resort:
             plan = checked(plan, observation, self._road, self.settings)
-        self._last = plan.controls[0]
         return replace(plan, social_time=social_time, solver=self._mpc.how)
 
     def _agreement(
@@ -155,7 +152,6 @@ class CohesivePlanner:
             place_weight=place_weight,
             place_target=place_target,
             constraint_weight=np.array([self.settings.constraint * (1.0 + pressure)]),
-            last=self._last,
         )
 
     def _place(self, place: Place) -> tuple[FloatArray, FloatArray]:

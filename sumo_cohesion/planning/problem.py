@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from sumo_cohesion.state import Control, FloatArray
+from sumo_cohesion.state import FloatArray
 
 FAR_AWAY = 1e4
 """Metres at which lanes and cars that do not exist are put: their Gaussians are zero there."""
@@ -27,7 +27,6 @@ class Problem:
     cohesion_weight, cohesion_target : (k, T), beta included; zero weights: not cohesive.
     place_weight, place_target : (T,) per m², beta included, and m: where across the road.
     constraint_weight : (1,) per m beyond a constraint.
-    last : the control driven last; None at the start.
     """
 
     ego: FloatArray
@@ -45,7 +44,6 @@ class Problem:
     place_weight: FloatArray
     place_target: FloatArray
     constraint_weight: FloatArray
-    last: Control | None = None
 
 
 @dataclass(frozen=True)

@@ -41,10 +41,8 @@ class PlannerSettings(BaseModel):
     friction : linear friction (1/s) of the point mass.
     max_curvature : bound (1/m) on the driven path's curvature.
     max_braking, max_acceleration : bounds (m/s²) on the change of speed.
-    max_lateral_acceleration : bound (m/s²) on speed² · curvature.
-    max_curvature_rate, max_jerk : bounds (1/m/s and m/s³) on the change of the driven controls.
-    constraint : cost per metre beyond a constraint (planning.constraints), in units of what the
-        plan could otherwise win.
+    constraint : cost per metre too close to a visible car (planning.constraints), in units of what
+        cohesion could win by it.
     cars : how many of the nearest vehicles are avoided.
     solver : ilqr (planning.ilqr), the fast one; fatrop and ipopt, CasADi's interior point methods;
         lbfgs, the paper's own.
@@ -60,9 +58,6 @@ class PlannerSettings(BaseModel):
     max_curvature: Positive = 0.01
     max_braking: Positive = 8.0
     max_acceleration: Positive = 4.8
-    max_lateral_acceleration: Positive = 6.0
-    max_curvature_rate: Positive = 0.05
-    max_jerk: Positive = 40.0
     constraint: NonNegative = 20.0
     cars: Annotated[int, Field(ge=1, le=100)] = 8
     solver: Literal["ilqr", "fatrop", "ipopt", "lbfgs"] = "ilqr"

@@ -16,7 +16,7 @@ from sumo_cohesion.planning.dynamics import DT
 from sumo_cohesion.planning.problem import Problem
 from sumo_cohesion.planning.settings import PlannerSettings, RewardWeights
 from sumo_cohesion.social.features import FEATURES, social_features
-from sumo_cohesion.state import Control, FloatArray
+from sumo_cohesion.state import FloatArray
 
 CONTROL_SCALE = np.array([0.01, 5.0])
 """Curvature (1/m) and acceleration (m/s²) that solvers see as one."""
@@ -114,7 +114,7 @@ def make_stage(settings: PlannerSettings, parameters: StageParameters) -> Stage:
     psi = ca.vertcat(*social_features(before, after, DT, p["road_curvature"]))
     missed, aside = psi - p["cohesion_target"], after[1] - p["place_target"]
     terms["cohesion"] = -ca.dot(p["cohesion_weight"], missed**2) - p["place_weight"] * aside**2
-    violation = constraints.violations(after, inputs, p["ego_width"])
+    violation = constraints.violations(after, inputs)
     terms["constraints"] = -p["constraint_weight"] * ca.sum1(constraints.penalties(violation))
     rows = reward.squares(after, physical, inputs, p["ego_width"])
     pairs = [(r, theta[name] * w) for name in rows for r, w in rows[name]]
@@ -132,24 +132,14 @@ def make_stage(settings: PlannerSettings, parameters: StageParameters) -> Stage:
     )
 
 
-def control_bounds(
-    settings: PlannerSettings, speed: float, last: Control | None
-) -> tuple[FloatArray, FloatArray]:
-    """Lowest and highest scaled controls of every stage, (T, 2) each.
+def control_bounds(settings: PlannerSettings, speed: float) -> tuple[FloatArray, FloatArray]:
+    """Lowest and highest scaled controls of every stage, (T, 2) each, at a speed (m/s).
 
-    Braking and acceleration are bounded as what they do to the speed, friction included; the
-    curvature also by the lateral acceleration at the present ``speed`` (m/s). The first control,
-    the only one that is driven, stays near the one driven ``last``.
+    Braking and acceleration are bounded as what they do to the speed, friction included.
     """
-    drag = settings.friction * speed
-    bend = min(settings.max_curvature, settings.max_lateral_acceleration / max(speed, 1.0) ** 2)
+    drag, bend = settings.friction * speed, settings.max_curvature
     low = np.tile((-bend, drag - settings.max_braking), (settings.horizon, 1))
     high = np.tile((bend, drag + settings.max_acceleration), (settings.horizon, 1))
-    if last is not None:
-        change = DT * np.array((settings.max_curvature_rate, settings.max_jerk))
-        # What was driven may lie outside of today's bounds: they come first.
-        near = np.clip(last, low[0], high[0])
-        low[0], high[0] = np.maximum(low[0], near - change), np.minimum(high[0], near + change)
     return low / CONTROL_SCALE, high / CONTROL_SCALE
 
 

@@ -1,0 +1,108 @@
+"""The last resort and the exact penalty: what cohesion can never buy."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sumo_cohesion.planning.dynamics import step
+from sumo_cohesion.planning.planners import CohesivePlanner
+from sumo_cohesion.planning.safety import checked, safe_distance
+from sumo_cohesion.planning.settings import PlannerSettings
+from sumo_cohesion.road import Road
+from sumo_cohesion.social.memory import new_history
+from sumo_cohesion.social.settings import CohesionSettings
+from sumo_cohesion.state import Control, Observation, Plan, RoadState
+
+SETTINGS = PlannerSettings()
+
+
+def scene(
+    ego: tuple[float, float, float, float], *cars: tuple[float, float, float, float]
+) -> Observation:
+    """An ego and cars, each s, d, heading, speed."""
+    return Observation(
+        time=0.0,
+        ego=RoadState(*ego),
+        ego_size=(5.0, 1.8),
+        ids=tuple(f"car_{i}" for i in range(len(cars))),
+        states=np.array(cars, dtype=float).reshape(-1, 4),
+        sizes=np.tile([5.0, 1.8], (len(cars), 1)),
+        curvature=np.zeros(len(cars)),
+        voter=(True,) * len(cars),
+    )
+
+
+def planned(observation: Observation, curvature: float, acceleration: float) -> Plan:
+    ego = observation.ego
+    control = Control(curvature, acceleration + SETTINGS.friction * ego.speed)
+    after = step(ego, control, 0.1, SETTINGS.friction)
+    return Plan((control,), np.array((ego, after)), "solved")
+
+
+def test_a_safe_plan_is_left_alone(highway: Road) -> None:
+    observation = scene((100.0, 0.0, 0.0, 25.0), (140.0, 0.0, 0.0, 25.0), (100.0, 3.5, 0.0, 25.0))
+    plan = planned(observation, 0.0, 0.0)
+    assert checked(plan, observation, highway, SETTINGS) is plan
+
+
+def test_too_close_behind_a_car_the_ego_brakes_with_its_most(highway: Road) -> None:
+    observation = scene((100.0, 0.0, 0.0, 25.0), (115.0, 0.0, 0.0, 15.0))
+    plan = checked(planned(observation, 0.0, 1.0), observation, highway, SETTINGS)
+    assert plan.intervened
+    assert "too close behind car_0" in plan.status
+    change = plan.states[1, 3] - plan.states[0, 3]
+    assert change == pytest.approx(-0.1 * SETTINGS.max_braking)
+    # A car in the next lane is nobody's business.
+    beside = scene((100.0, 0.0, 0.0, 25.0), (115.0, 3.5, 0.0, 15.0))
+    assert not checked(planned(beside, 0.0, 1.0), beside, highway, SETTINGS).intervened
+
+
+def test_the_safe_distance_is_enough_when_the_car_ahead_brakes_its_hardest() -> None:
+    for speed, ahead in ((25.0, 25.0), (30.0, 20.0), (10.0, 0.0), (20.0, 30.0)):
+        gap = safe_distance(speed, ahead, SETTINGS)
+        v, f, g = speed, ahead, gap
+        v_next = v + 0.1 * SETTINGS.max_acceleration  # one more step of the worst plan
+        f_next = max(f - 0.8, 0.0)
+        g += 0.05 * (f + f_next) - 0.05 * (v + v_next)
+        v, f, least = v_next, f_next, g
+        while v > 0.0:
+            v_next, f_next = max(v - 0.8, 0.0), max(f - 0.8, 0.0)
+            g += 0.05 * (f + f_next) - 0.05 * (v + v_next)
+            v, f, least = v_next, f_next, min(least, g)
+        assert least >= -0.05 * SETTINGS.max_braking  # within one step's rounding
+
+
+def test_beside_a_car_the_ego_does_not_move_closer(highway: Road) -> None:
+    observation = scene((100.0, 1.2, 0.05, 25.0), (101.0, 3.3, 0.0, 25.0))
+    plan = checked(planned(observation, 0.005, 0.0), observation, highway, SETTINGS)
+    assert plan.intervened
+    assert "too close beside car_0" in plan.status
+    assert plan.controls[0].curvature < 0.0
+
+
+@pytest.mark.parametrize("beta", [0.09, 10.0, 1e4])
+def test_no_beta_buys_a_collision(highway: Road, beta: float) -> None:
+    """Follow nobody into a car: all who passed here moved left, but a car stands there."""
+    cohesion = CohesionSettings(beta=beta)
+    planner = CohesivePlanner(SETTINGS, cohesion)
+    planner.reset(highway)
+    ego = (300.0, 0.0, 0.0, 20.0)
+    history = new_history(cohesion, 0.1)
+    for k in range(60):
+        t = 0.1 * k
+        cars = [
+            (s + 20.0 * t, max(0.1 * (s + 20.0 * t - 300.0), 0.0), 0.0, 20.0)
+            for s in (255.0, 245.0, 235.0)
+        ]
+        seen = scene((300.0 - 20.0 * (6.0 - t), 0.0, 0.0, 20.0), *cars, (315.0, 2.6, 0.0, 0.0))
+        history.push(seen)
+    nearest = np.inf
+    for _ in range(15):
+        seen = scene(ego, (315.0, 2.6, 0.0, 0.0))
+        plan = planner.plan(seen, history)
+        after = step(ego, plan.controls[0], 0.1, SETTINGS.friction)
+        ego = tuple(float(v) for v in after)  # type: ignore[assignment]
+        if abs(ego[0] - 315.0) < 5.0:
+            nearest = min(nearest, abs(ego[1] - 2.6) - 1.8)
+    assert nearest > 0.0
