@@ -20,7 +20,7 @@ SETTINGS = PlannerSettings()
 def scene(
     ego: tuple[float, float, float, float], *cars: tuple[float, float, float, float]
 ) -> Observation:
-    """An ego and cars, each s, d, heading, speed."""
+    """Make an observation of an ego and cars, each s, d, heading, speed."""
     return Observation(
         time=0.0,
         ego=RoadState(*ego),
