@@ -44,13 +44,13 @@ lock: $(VENV)/.installed
 	$(BIN)/uv pip compile pyproject.toml --all-extras --universal --no-annotate --no-header \
 	  --no-emit-index-url --no-emit-find-links --python-version 3.11 -o requirements.lock
 
-# The claims and the figures: about an hour on two cores. After a stop it goes on.
+# The claims and the figures: about 20 minutes on two cores. After a stop it goes on.
 reproduce: $(VENV)/.installed
-	$(BIN)/python analysis/reproduce.py
+	$(BIN)/python -m analysis.reproduce
 	$(BIN)/python -m analysis.markdown
 	$(BIN)/python analysis/figures.py
 
-# What each addition to the printed formula is worth: about ten minutes.
+# What each addition to the printed formula is worth: a few minutes.
 ablation: $(VENV)/.installed
 	$(BIN)/python -m analysis.ablation
 	$(BIN)/python -m analysis.markdown

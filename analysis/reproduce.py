@@ -1,6 +1,6 @@
 """The paper's claims, measured: every scenario, every planner, paired seeds.
 
-    python analysis/reproduce.py [--seeds 0:50] [--workers 2] [--cases "stalled; exit" --out DIR]
+    python -m analysis.reproduce [--seeds 0:50] [--workers 2] [--cases "stalled; exit" --out DIR]
 
 Writes into analysis/: claims.csv (each claim's rate with its 95 % Wilson interval), outcomes.csv
 (what happened per case and planner), runs.parquet (all metrics of all runs) and reproduce.json
@@ -316,7 +316,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     everything = pd.concat([own.assign(case=case) for case, own in runs.items()])
     everything.to_parquet(given.out / "runs.parquet", index=False)
     about = {
-        "command": f"python analysis/reproduce.py --seeds {given.seeds}"
+        "command": f"python -m analysis.reproduce --seeds {given.seeds}"
         + (f' --cases "{given.cases}"' if given.cases else ""),
         "seeds": given.seeds,
         "cases": {case: {"scenario": CASES[case][0], **CASES[case][1]} for case in cases},
