@@ -18,9 +18,9 @@ from typing import Any
 import pandas as pd
 
 from analysis.reproduce import HERE, Case, run_cases
-from sumo_cohesion.cli import parse_seeds
 from sumo_cohesion.errors import SimulationError, UserError
 from sumo_cohesion.experiments.rollout import versions
+from sumo_cohesion.experiments.scenario import parse_seeds
 
 PIECES: dict[str, Mapping[str, Any]] = {
     "default": {},

@@ -46,7 +46,7 @@ class Reference:
             change = plan.states - nominal.states
             lateral, speed = change[np.abs(change).argmax(axis=0), range(4)][[1, 3]]
         else:
-            lateral = speed = np.nan  # SUMO drives, or the plan is a fallback: nothing to compare
+            lateral = speed = np.nan  # SUMO drives, a fallback or last resort: nothing to compare
         twin = self._sensor.observe(replace(scene, ego=self._twin or scene.ego))
         self.rows.append(
             {

@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import os
+import platform
 import shutil
 import subprocess
 import tempfile
@@ -39,7 +40,12 @@ def compiled(functions: Sequence[Any]) -> tuple[list[Any], str]:
         return list(functions), "not compiled: no C compiler (cc, gcc or clang) found"
     try:
         library = _library(functions, compiler)
-        return [ca.external(f.name(), str(library)) for f in functions], "compiled"
+        try:
+            return [ca.external(f.name(), str(library)) for f in functions], "compiled"
+        except RuntimeError:  # damaged, or made for another machine: make it again, once
+            library.unlink(missing_ok=True)
+            library = _library(functions, compiler)
+            return [ca.external(f.name(), str(library)) for f in functions], "compiled"
     except (OSError, subprocess.SubprocessError, RuntimeError) as error:
         said = " ".join(str(error).split())[:200]
         return list(functions), f"not compiled: {said}"
@@ -54,7 +60,8 @@ def _library(functions: Sequence[Any], compiler: str) -> Path:
     """Path of the functions' library, made if it is not there."""
     code = _c_code(functions)
     stat, casadi = Path(compiler).resolve().stat(), version("casadi")
-    about = f"{compiler} {stat.st_size} {stat.st_mtime_ns} {OPTIONS} {casadi}\n{code}"
+    machine = f"{platform.machine()} {platform.libc_ver()}"  # homes are shared between them
+    about = f"{machine} {compiler} {stat.st_size} {stat.st_mtime_ns} {OPTIONS} {casadi}\n{code}"
     folder = cache_folder()
     folder.mkdir(parents=True, exist_ok=True)
     library = folder / f"{hashlib.sha256(about.encode()).hexdigest()[:32]}.so"

@@ -1,8 +1,10 @@
 """What no plan may do for any reward: come too close to a visible car.
 
-An exact penalty: beyond the limit it costs in proportion to how far (not to its square), and more
-per metre than anything the plan could win there, cohesion included. So a plan keeps to the limit
-where it can, and where it cannot, as when it starts beyond, the problem still has a solution.
+An exact penalty: beyond the limit it costs in proportion to how far (not to its square), and the
+more the more cohesion could win by it. So a plan keeps to the limit where it can within its
+horizon, and where it cannot, as when it starts beyond, the problem still has a solution. What needs
+more warning than the horizon, such as stopping behind a standing car, is the last resort's
+(planning.safety).
 Bounds on the controls are no penalties: solvers keep to them exactly (stage.control_bounds).
 """
 
@@ -14,8 +16,8 @@ import casadi as ca
 
 from sumo_cohesion.planning.reward import StageInputs
 
-CORNERS = 2.0**0.25
-"""Size of the superellipse of fourth order that holds a box, relative to the box."""
+CORNERS = 2.0**0.125
+"""Size of the superellipse of eighth order that holds a box, relative to the box."""
 _SMOOTH = 0.05
 """Metres over which the penalty's slope grows from zero, so that it has a gradient everywhere."""
 
@@ -30,7 +32,7 @@ def violations(state: Any, inputs: StageInputs) -> Any:
     cos, sin, half_length, half_width = cars[2, :], cars[3, :], cars[4, :], cars[5, :]
     along = (ds * cos + dd * sin) / half_length
     across = (dd * cos - ds * sin) / half_width
-    distance = (along**4 + across**4 + 1e-6) ** 0.25
+    distance = (along**8 + across**8 + 1e-12) ** 0.125
     return ((CORNERS - distance) * half_width).T
 
 

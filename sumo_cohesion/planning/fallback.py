@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from math import isfinite
+
 import numpy as np
 
 from sumo_cohesion.planning.dynamics import DT
@@ -43,6 +45,7 @@ def keep_lane(observation: Observation, road: Road, settings: PlannerSettings) -
     ego = observation.ego
     centre = road.nearest_lane(ego.s, ego.d)
     reach = max(0.7 * ego.speed, 5.0)
-    bend = -2.0 * ego.heading / reach - (ego.d - centre) / reach**2
+    off = ego.d - centre if isfinite(centre) else 0.0  # there is no lane here
+    bend = -2.0 * ego.heading / reach - off / reach**2
     curvature = float(road.curvature_at(ego.s)) + bend
     return min(max(curvature, -settings.max_curvature), settings.max_curvature)

@@ -43,8 +43,10 @@ _SHORTEST_STEP = 0.01
 _SHORTEN = 0.4
 _SUFFICIENT = 1e-4
 """Share of the decrease promised by the model that a step must give."""
-_REGULARISATION = (1e-9, 1e-4, 1e4)
+_REGULARISATION = (1e-9, 1e-4, 1e12)
 """Least, first one that acts, and largest value added to the controls' Hessian."""
+_GOOD_SHARE = 0.25
+"""Share of the promised decrease that must come true for the regularisation to be lowered."""
 
 
 class Ilqr:
@@ -109,8 +111,11 @@ class Ilqr:
             new_cost = self._search(cost, promised)
             if new_cost is not None:
                 self._accept()
-                small = cost - new_cost < TOLERANCE * (1.0 + abs(cost))
-                cost, exact, mu = new_cost, True, max(0.1 * mu, _REGULARISATION[0])
+                gained = cost - new_cost
+                small = gained < TOLERANCE * (1.0 + abs(cost))
+                if gained > _GOOD_SHARE * promised:
+                    mu = max(0.1 * mu, _REGULARISATION[0])
+                cost, exact = new_cost, True
                 if small:
                     return self._result("solved", iteration, start, solved=True)
             elif exact:

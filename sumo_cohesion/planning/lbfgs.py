@@ -33,20 +33,24 @@ class Lbfgs:
         t = settings.horizon
         ego, u = ca.MX.sym("ego", 4), ca.MX.sym("u", 2, t)
         p = ca.MX.sym("p", parameters.size, t)
-        state, total, states = ego, ca.MX.zeros(len(TERMS)), [ego]
+        state, total, states, driven = ego, ca.MX.zeros(len(TERMS)), [ego], []
         for i in range(t):
-            state, _, gained = one(state, u[:, i], p[:, i], -ca.inf, ca.inf)
+            state, control, gained = one(state, u[:, i], p[:, i], -ca.inf, ca.inf)
             states.append(state)
+            driven.append(control)
             total += gained
         cost = -ca.sum1(total)
         function = ca.Function(
-            "cost", [ego, u, p], [cost, ca.gradient(cost, u), ca.horzcat(*states), total]
+            "cost",
+            [ego, u, p],
+            [cost, ca.gradient(cost, u), ca.horzcat(*states), ca.horzcat(*driven), total],
         )
         (function,), self.how = compiled([function])
         self._ego, self._u, self._p = np.zeros(4), np.zeros((t, 2)), np.zeros((t, p.shape[0]))
         self._cost, self._gradient = np.zeros(1), np.zeros((t, 2))
-        self._states, self._terms = np.zeros((t + 1, 4)), np.zeros(len(TERMS))
-        outputs = [self._cost, self._gradient, self._states, self._terms]
+        self._states, self._driven = np.zeros((t + 1, 4)), np.zeros((t, 2))
+        self._terms = np.zeros(len(TERMS))
+        outputs = [self._cost, self._gradient, self._states, self._driven, self._terms]
         self._run = BoundCall(function, [self._ego, self._u, self._p], outputs)
 
     def solve(self, instance: Instance, guess: Guess) -> Solution:
@@ -68,7 +72,7 @@ class Lbfgs:
         solved = bool(np.isfinite(result.fun)) and result.status in (0, 2)
         return Solution(
             states=self._states.copy(),
-            controls=self._u * CONTROL_SCALE,
+            controls=self._driven * CONTROL_SCALE,
             solved=solved,
             status="solved" if solved else f"{self.name} returned {result.message}",
             iterations=int(result.nit),

@@ -88,7 +88,7 @@ class Mpc:
         second = self._second.solve(instance, guess)
         return replace(
             second,
-            status=second.status if second.solved else f"{failed.status}; {second.status}",
+            status="rescued by ipopt" if second.solved else f"{failed.status}; {second.status}",
             iterations=failed.iterations + second.iterations,
             wall_time=failed.wall_time + second.wall_time,
         )

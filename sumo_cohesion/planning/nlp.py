@@ -78,6 +78,9 @@ class InteriorPoint:
         z = np.asarray(result["x"]).ravel()
         solved = bool(stats["success"]) and bool(np.isfinite(z.sum()))
         states, controls = self._unpack(z)
+        # Interior point methods are allowed to be a hair outside.
+        low, high = instance.low * CONTROL_SCALE, instance.high * CONTROL_SCALE
+        controls = np.clip(controls, low, high)
         values = np.asarray(self._terms(z, parameters)).ravel().tolist() if solved else []
         return Solution(
             states=states,

@@ -134,7 +134,7 @@ class CohesivePlanner:
             weight[:, 0] = self.cohesion.beta * np.array(term.weight)
             target[:, 0] = term.target
         place_weight, place_target = self._place(place)
-        # More per metre than all that cohesion could win by it: no beta buys a collision.
+        # The more, the more cohesion could win by coming too close.
         pressure = float(weight.sum() + place_weight.sum() * PLACE_SCALE**2)
         return Problem(
             ego=np.array(ego),

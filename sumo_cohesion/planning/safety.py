@@ -7,6 +7,7 @@ that is driven. What cohesion wants does not enter.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from math import cos, sin
 
@@ -14,7 +15,6 @@ import numpy as np
 
 from sumo_cohesion.planning import dynamics
 from sumo_cohesion.planning.dynamics import DT
-from sumo_cohesion.planning.fallback import keep_lane
 from sumo_cohesion.planning.settings import PlannerSettings
 from sumo_cohesion.road import Road
 from sumo_cohesion.state import Control, Observation, Plan
@@ -31,38 +31,46 @@ def checked(plan: Plan, observation: Observation, road: Road, settings: PlannerS
     - *Too close behind a car ahead*: if it braked with HARDEST_BRAKING, the ego, braking with its
       own most after one step, would hit it. The ego brakes with its most now.
     - *Too close beside a car*: the plan moves towards a car whose side is nearer than SIDE_MARGIN.
-      The ego steers to keep its lane instead.
+      The ego goes straight on instead, or on away from the car if that is what it planned.
 
-    Returns the same plan, or one of a single control that says which cars were too close.
+    Returns the same plan, or one of a single control that says which cars were too close. Cars that
+    come the other way are taken as standing.
     """
     if not plan.controls:
         return plan
     control, ego = plan.controls[0], observation.ego
-    after = dynamics.step(ego, control, DT, settings.friction, float(road.curvature_at(ego.s)))
-    half_length, half_width = (size / 2 for size in observation.ego_size)
-    reasons, brake, straighten = [], False, False
-    states, sizes = observation.states.tolist(), observation.sizes.tolist()
-    for name, state, (length, width) in zip(observation.ids, states, sizes, strict=True):
-        s, d, heading, speed = state
-        along, across = speed * cos(heading), speed * sin(heading)
-        ahead = s + DT * along - after[0] - half_length - length / 2
-        aside = abs(d + DT * across - after[1]) - half_width - width / 2
-        if s > ego.s and aside < 0.0 and ahead < safe_distance(after[3], along, settings):
-            brake = True
-            reasons.append(f"too close behind {name}")
-        beside = abs(s - ego.s) < half_length + length / 2
-        closing = (after[1] - ego.d - DT * across) * (d - ego.d) > 0.0
-        if beside and closing and aside < SIDE_MARGIN:
-            straighten = True
-            reasons.append(f"too close beside {name}")
+    bend = float(road.curvature_at(ego.s))
+    after = dynamics.step(ego, control, DT, settings.friction, bend)
+    # The curvature with which the ego goes parallel to the road after one step.
+    level = bend * cos(ego.heading) / (1.0 - bend * ego.d)
+    level -= ego.heading / (DT * max(after[3], 1.0))
+    level = min(max(level, -settings.max_curvature), settings.max_curvature)
     hardest = settings.friction * ego.speed - min(settings.max_braking, ego.speed / DT)
-    safe = Control(
-        keep_lane(observation, road, settings) if straighten else control.curvature,
-        min(control.acceleration, hardest) if brake else control.acceleration,
-    )
-    if safe == control:
+    curvature, acceleration, reasons = control.curvature, control.acceleration, []
+    own = _extent(ego.heading, observation.ego_size)
+    states, sizes = observation.states.tolist(), observation.sizes.tolist()
+    stretches = (1.0 - observation.curvature * observation.states[:, 1]).tolist()
+    for name, state, size, stretch in zip(observation.ids, states, sizes, stretches, strict=True):
+        s, d, heading, speed = state
+        other = _extent(heading, size)
+        along, across = speed * cos(heading), speed * sin(heading)
+        ahead = s + DT * along / stretch - after[0] - own[0] - other[0]
+        aside = abs(d + DT * across - after[1]) - own[1] - other[1]
+        behind = s > ego.s and aside < 0.0
+        if behind and ahead < safe_distance(after[3], along, settings):
+            if acceleration > hardest + 1e-9:
+                acceleration = hardest
+                reasons.append(f"too close behind {name}")
+            continue
+        if abs(s - ego.s) < own[0] + other[0] and aside < SIDE_MARGIN:
+            straight = min(curvature, level) if d > ego.d else max(curvature, level)
+            if straight != curvature:
+                curvature = straight
+                reasons.append(f"too close beside {name}")
+    if not reasons:
         return plan
-    after = dynamics.step(ego, safe, DT, settings.friction, float(road.curvature_at(ego.s)))
+    safe = Control(curvature, acceleration)
+    after = dynamics.step(ego, safe, DT, settings.friction, bend)
     return replace(
         plan,
         controls=(safe,),
@@ -72,11 +80,19 @@ def checked(plan: Plan, observation: Observation, road: Road, settings: PlannerS
     )
 
 
+def _extent(heading: float, size: Sequence[float]) -> tuple[float, float]:
+    """Half of what a turned box of (length, width) covers along and across the road (m)."""
+    length, width, c, s = size[0] / 2, size[1] / 2, abs(cos(heading)), abs(sin(heading))
+    return length * c + width * s, length * s + width * c
+
+
 def safe_distance(speed: float, speed_ahead: float, settings: PlannerSettings) -> float:
     """Metres that the ego needs behind a car, bumper to bumper.
 
-    It may accelerate for one more step before it brakes.
+    It may accelerate for one more step before it brakes. That it brakes no harder than the car
+    ahead can is assumed: then the gap is smallest when both stand.
     """
     faster = speed + DT * settings.max_acceleration
-    way = DT * (speed + faster) / 2 + faster**2 / (2 * settings.max_braking)
+    braking = min(settings.max_braking, HARDEST_BRAKING)
+    way = DT * (speed + faster) / 2 + faster**2 / (2 * braking)
     return max(way - max(speed_ahead, 0.0) ** 2 / (2 * HARDEST_BRAKING), 0.0)

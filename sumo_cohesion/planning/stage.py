@@ -24,7 +24,8 @@ TERMS = (*RewardWeights.model_fields, "cohesion", "constraints")
 """Names of the parts of a stage's reward."""
 
 # NumPy's functions on CasADi symbols return CasADi symbols.
-ca.GlobalOptions.setNumpyMode(1)
+if hasattr(ca.GlobalOptions, "setNumpyMode"):  # CasADi 3.8; before, they always do
+    ca.GlobalOptions.setNumpyMode(1)
 
 
 class Stage(NamedTuple):

@@ -81,6 +81,56 @@ def test_beside_a_car_the_ego_does_not_move_closer(highway: Road) -> None:
     assert plan.controls[0].curvature < 0.0
 
 
+@pytest.mark.parametrize(
+    ("ego", "cars", "curvature"),
+    [
+        # The nearest lane's centre, 3.5, is on the other car's side; the plan is straight on.
+        ((100.0, 1.9, 0.0, 25.0), [(100.0, 3.8, 0.0, 25.0)], 0.0),
+        # Between two cars.
+        ((100.0, -1.0, 0.0, 25.0), [(100.0, -3.05, 0.0, 25.0), (100.0, 1.1, 0.0, 25.0)], 0.0),
+        # The plan already evades as hard as it can.
+        ((100.0, -1.2, 0.05, 25.0), [(100.0, 1.1, 0.0, 25.0)], -0.01),
+        # A human merges into the ego, which evades.
+        ((100.0, 0.0, 0.0, 25.0), [(100.0, 2.1, -0.03, 25.0)], -0.01),
+    ],
+)
+def test_beside_a_car_no_plan_is_made_worse(
+    highway: Road,
+    ego: tuple[float, float, float, float],
+    cars: list[tuple[float, float, float, float]],
+    curvature: float,
+) -> None:
+    def least_gap(*, last_resort: bool) -> float:
+        state, others, least = ego, list(cars), np.inf
+        for _ in range(8):
+            observation = scene(state, *others)
+            plan = planned(observation, curvature, 0.0)
+            if last_resort:
+                plan = checked(plan, observation, highway, SETTINGS)
+            after = step(state, plan.controls[0], 0.1, SETTINGS.friction)
+            state = tuple(float(v) for v in after)  # type: ignore[assignment]
+            others = [
+                (s + 0.1 * v * np.cos(h), d + 0.1 * v * np.sin(h), h, v) for s, d, h, v in others
+            ]
+            sides = [
+                abs(d - state[1])
+                - 1.8 / 2 * (np.cos(h) + np.cos(state[2]))
+                - 2.5 * (abs(np.sin(h)) + abs(np.sin(state[2])))
+                for _, d, h, _ in others
+            ]
+            least = min(least, *sides)
+        return float(least)
+
+    assert least_gap(last_resort=True) >= least_gap(last_resort=False) - 1e-9
+
+
+def test_braking_with_its_most_already_is_no_intervention(highway: Road) -> None:
+    for speed in np.linspace(10.0, 35.0, 200):
+        observation = scene((100.0, 0.0, 0.0, speed), (100.0 + 10.0, 0.0, 0.0, 5.0))
+        plan = planned(observation, 0.0, -SETTINGS.max_braking)
+        assert not checked(plan, observation, highway, SETTINGS).intervened
+
+
 @pytest.mark.parametrize("beta", [0.09, 10.0, 1e4])
 def test_no_beta_buys_a_collision(highway: Road, beta: float) -> None:
     """Follow nobody into a car: all who passed here moved left, but a car stands there."""

@@ -16,6 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sumo_cohesion.planning import compiled as compilation
+from sumo_cohesion.planning.dynamics import step
 from sumo_cohesion.planning.ilqr import _box_step
 from sumo_cohesion.planning.mpc import SOLVERS, Mpc
 from sumo_cohesion.planning.problem import FAR_AWAY, Problem
@@ -67,20 +68,21 @@ def solvers() -> dict[str, Mpc]:
 
 
 @pytest.mark.parametrize("seed", range(25))
-def test_no_solver_finds_a_better_plan_than_the_fast_one(
-    solvers: dict[str, Mpc], seed: int
-) -> None:
+def test_all_solvers_agree_and_keep_their_promises(solvers: dict[str, Mpc], seed: int) -> None:
     value = {}
     for name, mpc in solvers.items():
         mpc.reset()
         solution = mpc.solve(problem(seed))
-        assert solution.solved, solution.status
-        assert solution.status == "solved"
+        assert solution.status == "solved", name  # by itself: IPOPT has not had to help
+        for t, control in enumerate(solution.controls):
+            curvature = float(problem(seed).road_curvature[t])
+            again = step(solution.states[t], control, 0.1, SETTINGS.friction, curvature)
+            assert np.array(again) == pytest.approx(solution.states[t + 1], abs=1e-5)
         value[name] = sum(solution.reward.values())
-    # From the same start; another local optimum may be better, but seldom is.
-    assert value["ilqr"] >= value["ipopt"] - 1e-4 * (1.0 + abs(value["ipopt"])) or (
-        value["ilqr"] >= value["lbfgs"] - 1e-4 * (1.0 + abs(value["lbfgs"]))
-    )
+    # From the same start; now and then one of them finds another local optimum.
+    scale = 1e-4 * (1.0 + abs(value["ipopt"]))
+    others = sorted(v for name, v in value.items() if name != "ilqr")
+    assert value["ilqr"] >= others[1] - scale  # no worse than the middle one of the others
 
 
 def test_squares_have_the_gradient_of_the_cost_and_are_never_negative() -> None:
