@@ -5,7 +5,7 @@ NETCONVERT := $(BIN)/netconvert --offset.disable-normalization true --no-turnaro
 # Threads of the linear algebra library only cost time here: the matrices are tiny.
 export OPENBLAS_NUM_THREADS := 1
 
-.PHONY: demo test lint check format networks docs lock wheel benchmark reproduce ablation figures example clean
+.PHONY: demo test lint check format networks docs lock wheel benchmark benchmark-planner reproduce ablation figures example clean
 
 demo: $(VENV)/.installed
 	$(BIN)/sumo-cohesion compare stalled --seeds 0:8 --out demo
@@ -41,7 +41,7 @@ docs: $(VENV)/.installed
 	cp results/readme/paths.png docs/stalled_swerve.png
 
 lock: $(VENV)/.installed
-	$(BIN)/uv pip compile pyproject.toml --all-extras --universal --no-annotate --no-header \
+	$(BIN)/uv pip compile pyproject.toml --extra gui --extra cluster --extra dev --universal --no-annotate --no-header \
 	  --no-emit-index-url --no-emit-find-links --python-version 3.11 -o requirements.lock
 
 # The claims and the figures: about 20 minutes on two cores. After a stop it goes on.
@@ -61,6 +61,10 @@ figures: $(VENV)/.installed
 # The example of docs/batches.md: about ten minutes.
 example: $(VENV)/.installed
 	$(BIN)/python -m analysis.beta
+
+# Needs do-mpc and rockit: pip install -e '.[benchmark]'.
+benchmark-planner: $(VENV)/.installed
+	$(BIN)/python -m benchmarks.planner
 
 benchmark: $(VENV)/.installed
 	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python benchmarks/rooms.py | tee benchmarks/rooms.txt

@@ -39,7 +39,16 @@ def step(
     speed = speed + dt * (acceleration - friction * speed)
     # Metres of s per metre driven along the road: more on the inside of a bend.
     along = 1.0 / (1.0 - road_curvature * d)
-    heading_next = heading + dt * speed * (curvature - road_curvature * np.cos(heading) * along)
-    s = s + dt * speed * np.cos(heading_next) * along
-    d = d + dt * speed * np.sin(heading_next)
+    heading_next = heading + dt * speed * (curvature - road_curvature * _cos(heading) * along)
+    s = s + dt * speed * _cos(heading_next) * along
+    d = d + dt * speed * _sin(heading_next)
     return s, d, heading_next, speed
+
+
+def _cos(angle: Any) -> Any:
+    """Cosine of a number, an array or a symbol, whatever CasADi makes of NumPy's functions."""
+    return angle.cos() if hasattr(angle, "cos") else np.cos(angle)
+
+
+def _sin(angle: Any) -> Any:
+    return angle.sin() if hasattr(angle, "sin") else np.sin(angle)

@@ -23,10 +23,6 @@ CONTROL_SCALE = np.array([0.01, 5.0])
 TERMS = (*RewardWeights.model_fields, "cohesion", "constraints")
 """Names of the parts of a stage's reward."""
 
-# NumPy's functions on CasADi symbols return CasADi symbols.
-if hasattr(ca.GlobalOptions, "setNumpyMode"):  # CasADi 3.8; before, they always do
-    ca.GlobalOptions.setNumpyMode(1)
-
 
 class Stage(NamedTuple):
     """Expressions of one stage in ``state`` (4), ``control`` (2, scaled) and ``parameters``.
