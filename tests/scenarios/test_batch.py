@@ -373,7 +373,6 @@ def test_a_reason_that_is_no_text_does_not_spoil_the_batch(tmp_path: Path) -> No
         ({"planners": ["nominl"]}, "unknown planner 'nominl'"),
         ({"planners": [FAULTY + "NoSuch"]}, "has no 'NoSuch'"),
         ({"planners": [FAULTY + "CannotBeMade"]}, "callable without arguments"),
-        ({"planners": ["tests.scenarios.exits:Planner"]}, "cannot import"),
         ({"keep": ["everything"]}, "keep"),
         ({"colour": 1}, "unknown key 'colour'"),
     ],
@@ -385,6 +384,16 @@ def test_a_mistake_in_an_experiment_is_one_line(
         batch(SHORT | change, tmp_path / "out")
     assert "\n" not in str(error.value)
     assert not (tmp_path / "out" / "manifest.json").exists()
+
+
+def test_a_planner_that_ends_its_process_when_imported_is_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "this_exits.py").write_text("import sys\n\nsys.exit(0)\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(UserError, match="cannot import 'this_exits'"):
+        batch(SHORT | {"planners": ["this_exits:Planner"]}, tmp_path / "out")
 
 
 def test_numbers_and_texts_on_one_axis_make_a_column_of_texts() -> None:
