@@ -139,7 +139,7 @@ class Plan:
     ----------
     controls : the T planned controls; the first is driven. Empty: SUMO drives the ego.
     states : (T + 1, 4) predicted road states, the present one first.
-    status : "solved", "sumo", or why the plan is a fallback.
+    status : "solved", "rescued by ipopt", "sumo", or why the plan is a fallback.
     solver : which one, and whether it is compiled; empty for planners without.
     fallback : True if the solver gave nothing usable and the ego brakes in its lane.
     intervened : True if the last resort (planning.safety) changed the first control.

@@ -34,7 +34,7 @@ TRAJECTORY = (
 
 PLAN = (
     Column("time", "float64", "s", "SUMO time at which the plan was made"),
-    Column("status", "string", "", "'solved', 'sumo', or why the plan is a fallback"),
+    Column("status", "string", "", "solved, rescued by ipopt, sumo, or why the plan is a fallback"),
     Column("fallback", "bool", "", "the ego braked in lane because there was no usable plan"),
     Column("intervened", "bool", "", "the last resort changed the control; the status says why"),
     Column("iterations", "int64", "", "solver iterations"),
