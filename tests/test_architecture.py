@@ -12,9 +12,10 @@ import pytest
 PACKAGE = Path(__file__).resolve().parent.parent / "sumo_cohesion"
 
 # Rooms in the order of one step; a room may import those its row names, and the shared values.
-SHARED = {"errors", "state", "road"}
+SHARED = {"errors", "locks", "state", "road"}
 ALLOWED = {
     "errors": set(),
+    "locks": set(),
     "state": set(),
     "road": {"state"},
     "traffic": SHARED,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import json
-import tomllib
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -25,7 +24,7 @@ from pydantic import (
 
 from sumo_cohesion.batches.identity import point_digest, run_key
 from sumo_cohesion.errors import UserError
-from sumo_cohesion.experiments.scenario import parse_seeds, validated
+from sumo_cohesion.experiments.scenario import parse_seeds, read_toml, validated
 from sumo_cohesion.experiments.setup import resolve
 from sumo_cohesion.planning.planners import check_planner
 from sumo_cohesion.traffic.outputs import Output
@@ -180,13 +179,7 @@ def load_experiment(source: str | Path | Mapping[str, Any]) -> Experiment:
     if isinstance(source, Mapping):
         return validated(Experiment, dict(source), "experiment")
     path = Path(source)
-    try:
-        data = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise UserError(f"{path}: cannot be read ({error.strerror})") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise UserError(f"{path}: not valid TOML: {error}") from None
-    experiment = validated(Experiment, data, str(path))
+    experiment = validated(Experiment, read_toml(path), str(path))
     experiment._folder = path.parent.resolve()
     return experiment
 

@@ -28,6 +28,7 @@ import pandas as pd
 from sumo_cohesion.batches.job import table_file
 from sumo_cohesion.errors import StorageError, UserError
 from sumo_cohesion.experiments.columns import BATCH, METRICS
+from sumo_cohesion.locks import alone
 
 MANIFEST = "manifest.json"
 FORMAT = 1
@@ -132,7 +133,7 @@ class Store:
     def join(self) -> pd.DataFrame:
         """Write metrics.parquet: what load_metrics gives, for those who read without us."""
         # Of several shards, the one that writes last must also have read last.
-        with storing(self.folder), _alone(self._runs / ".join.lock"):
+        with storing(self.folder), alone(self._runs / ".join.lock"):
             self._close_journal()
             table = joined(self.folder)
             _write_parquet(table, self.folder / "metrics.parquet")
@@ -290,17 +291,6 @@ def _locked(path: Path) -> IO[str] | None:
     except OSError:  # a file system without locks
         return file
     return file
-
-
-@contextlib.contextmanager
-def _alone(path: Path) -> Iterator[None]:
-    """Wait until no other process holds this lock."""
-    with path.open("w") as file:
-        with contextlib.suppress(ImportError, OSError):
-            import fcntl
-
-            fcntl.flock(file, fcntl.LOCK_EX)
-        yield
 
 
 class storing:  # noqa: N801 - reads as a function where it is used

@@ -148,17 +148,22 @@ def load_scenario(source: str | Path, overrides: Mapping[str, Any] | None = None
                 f"{', '.join(names)}, or give the path of a .toml file"
             )
         path = bundled("scenarios") / f"{source}.toml"
+    data = read_toml(path)
+    scenario = validated(Scenario, merge(data, overrides or {}), str(path))
+    scenario._folder = path.parent.resolve()
+    return scenario
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """Read a user's TOML file; raises UserError if it cannot be."""
     try:
-        data = tomllib.loads(path.read_text(encoding="utf-8"))
+        return tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise UserError(f"{path}: cannot be read ({error.strerror})") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise UserError(f"{path}: not valid TOML: {error}") from None
     except ValueError as error:
         raise UserError(f"{str(path)!r}: not a file's name ({error})") from None
-    scenario = validated(Scenario, merge(data, overrides or {}), str(path))
-    scenario._folder = path.parent.resolve()
-    return scenario
 
 
 def settings_from(

@@ -8,20 +8,20 @@ bit, so that results do not depend on whether there is a compiler.
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import os
 import platform
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import casadi as ca
 
+from sumo_cohesion.locks import alone
 from sumo_cohesion.state import FloatArray
 
 SWITCH = "SUMO_COHESION_COMPILE"
@@ -66,7 +66,7 @@ def _library(functions: Sequence[Any], compiler: str) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     library = folder / f"{hashlib.sha256(about.encode()).hexdigest()[:32]}.so"
     if not library.exists():
-        with _alone(library.with_suffix(".lock")):  # one compiles, the others wait for it
+        with alone(library.with_suffix(".lock")):  # one compiles, the others wait for it
             if not library.exists():
                 _compile(code, compiler, library)
     return library
@@ -96,17 +96,6 @@ def _compile(code: str, compiler: str, library: Path) -> None:
         if done.returncode:
             raise RuntimeError(f"{compiler} failed: {done.stderr[-200:]}")
         new.replace(library)
-
-
-@contextlib.contextmanager
-def _alone(path: Path) -> Iterator[None]:
-    """Wait until no other process holds this lock; ended processes let go of it."""
-    with path.open("w") as file:
-        with contextlib.suppress(ImportError, OSError):
-            import fcntl
-
-            fcntl.flock(file, fcntl.LOCK_EX)
-        yield
 
 
 class BoundCall:
