@@ -136,10 +136,10 @@ class Road:
         right, left = self._strips[self.index(s), lane].T
         return right, left
 
-    def ahead(self, s: FloatArray, d: float) -> RoadAhead:
-        """Look the road up at places s (m), (n,), on the strip that holds d (m)."""
+    def ahead(self, s: FloatArray, d: ArrayLike) -> RoadAhead:
+        """Look the road up at places s (m), (n,), on the strip that holds d (m), one or (n,)."""
         i = self.index(s)
-        lane = np.abs(self._centre_or_far[i] - d).argmin(axis=1)
+        lane = np.abs(self._centre_or_far[i] - np.asarray(d, float)[..., None]).argmin(axis=1)
         right, left = self._strips[i, lane].T
         widths = self.lane_width[i]
         return RoadAhead(

@@ -1,11 +1,12 @@
-"""What no plan may do for any reward: come too close to a visible car.
+"""What no plan may do for any reward: come too close to a visible car, or leave the road.
 
 An exact penalty: beyond the limit it costs in proportion to how far (not to its square), and the
 more the more cohesion could win by it. So a plan keeps to the limit where it can within its
 horizon, and where it cannot, as when it starts beyond, the problem still has a solution. What needs
 more warning than the horizon, such as stopping behind a standing car, is the last resort's
 (planning.safety).
-Bounds on the controls are no penalties: solvers keep to them exactly (stage.control_bounds).
+Bounds on the controls and on their change are no penalties: solvers keep to them exactly
+(stage.control_limits).
 """
 
 from __future__ import annotations
@@ -22,11 +23,17 @@ _SMOOTH = 0.05
 """Metres over which the penalty's slope grows from zero, so that it has a gradient everywhere."""
 
 
-def violations(state: Any, inputs: StageInputs) -> Any:
-    """How far (m) a state is within every car's surroundings, a column; negative outside.
+def violations(state: Any, inputs: StageInputs, ego_width: Any) -> Any:
+    """How far (m) a state is beyond every limit, a column; negative where it keeps to it.
 
-    They are a superellipse around the two boxes put together; metres are measured across the car.
+    One per car: its surroundings are a superellipse around the two boxes put together, metres are
+    measured across the car. And the ego's sides beyond the right and the left edge of the road.
     """
+    right, left = inputs.right + ego_width / 2 - state[1], state[1] + ego_width / 2 - inputs.left
+    return ca.vertcat(_too_near(state, inputs), right, left)
+
+
+def _too_near(state: Any, inputs: StageInputs) -> Any:
     cars = inputs.cars
     ds, dd = state[0] - cars[0, :], state[1] - cars[1, :]
     cos, sin, half_length, half_width = cars[2, :], cars[3, :], cars[4, :], cars[5, :]

@@ -48,4 +48,5 @@ def keep_lane(observation: Observation, road: Road, settings: PlannerSettings) -
     off = ego.d - centre if isfinite(centre) else 0.0  # there is no lane here
     bend = -2.0 * ego.heading / reach - off / reach**2
     curvature = float(road.curvature_at(ego.s)) + bend
-    return min(max(curvature, -settings.max_curvature), settings.max_curvature)
+    sharpest = settings.sharpest(ego.speed)
+    return min(max(curvature, -sharpest), sharpest)

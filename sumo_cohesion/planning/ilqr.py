@@ -26,12 +26,13 @@ from sumo_cohesion.planning.problem import Guess, Instance, Solution
 from sumo_cohesion.planning.settings import PlannerSettings
 from sumo_cohesion.planning.stage import (
     CONTROL_SCALE,
+    N_STATES,
     TERMS,
     Stage,
     StageParameters,
+    control_limits,
+    limited_stage,
     make_stage,
-    standstill,
-    stopping_stage,
 )
 
 TOLERANCE = 1e-7
@@ -39,6 +40,8 @@ TOLERANCE = 1e-7
 _ROUNDING = 1e-4
 """Relative decrease that may be promised in vain at the end."""
 _LEAST_CURVATURE = 1e-8
+_AT_LIMIT = 1e-12
+"""Distance from a limit at which a scaled control is held by it."""
 _SHORTEST_STEP = 0.01
 _SHORTEN = 0.4
 _SUFFICIENT = 1e-4
@@ -70,14 +73,14 @@ class Ilqr:
     def _allocate(self) -> None:
         """Make the arrays that both functions read and write in place."""
         t, f = self._settings.horizon, np.zeros
-        self._x, self._x_new = f((t + 1, 4)), f((t + 1, 4))
+        self._x, self._x_new = f((t + 1, N_STATES)), f((t + 1, N_STATES))
         self._u, self._u_new = f((t, 2)), f((t, 2))
         self._p = f((t, self._parameters.size))
-        self._low, self._high = f((t, 2)), f((t, 2))
-        self._step, self._gain = f((t, 2)), f((t, 4, 2))
+        self._low, self._high, self._most = f((t, 2)), f((t, 2)), f((t, 2))
+        self._step, self._gain = f((t, 2)), f((t, N_STATES, 2))
         self._exact, self._mu, self._length = f(1), f(1), f(1)
         self._change, self._convexity, self._terms = f(1), f(1), f(len(TERMS))
-        bounds = [self._low, self._high]
+        bounds = [self._low, self._high, self._most]
         # A C-ordered (T, n) array is a CasADi matrix of T columns.
         self._run_backward = BoundCall(
             self._backward,
@@ -132,8 +135,8 @@ class Ilqr:
         )
 
     def _load(self, instance: Instance, guess: Guess) -> None:
-        self._p[:], self._x[0] = instance.stages, instance.ego
-        self._low[:], self._high[:] = instance.low, instance.high
+        self._p[:], self._x[0] = instance.stages, instance.start
+        self._low[:], self._high[:], self._most[:] = instance.low, instance.high, instance.change
         np.clip(guess.controls / CONTROL_SCALE, self._low, self._high, out=self._u)
         self._step[:], self._gain[:] = 0.0, 0.0
 
@@ -168,7 +171,7 @@ class Ilqr:
                 {},
             )
         return Solution(
-            states=self._x.copy(),
+            states=self._x[:, :4].copy(),
             controls=self._u * CONTROL_SCALE,
             solved=True,
             status=status,
@@ -179,55 +182,67 @@ class Ilqr:
 
 
 def _backward_pass(stage: Stage, settings: PlannerSettings) -> Any:
-    """(x, u, p, low, high, exact, mu) -> (steps, gains, change of cost, least curvature)."""
+    """(x, u, p, low, high, most, exact, mu) -> (steps, gains, change of cost, least curvature).
+
+    ``most`` bounds how much a control may differ from the one before.
+    """
     one = _riccati_step(stage, settings)
     t = settings.horizon
-    x, u = ca.MX.sym("x", 4, t + 1), ca.MX.sym("u", 2, t)
-    p = ca.MX.sym("p", stage.parameters.shape[0], t)
-    low, high = ca.MX.sym("low", 2, t), ca.MX.sym("high", 2, t)
+    n = N_STATES
+    x, u, p, *bounds = _trajectory(stage, t)
     exact, mu = ca.MX.sym("exact"), ca.MX.sym("mu")
-    gradient, hessian, change = ca.MX.zeros(4), ca.MX.zeros(4, 4), ca.MX(0)
+    gradient, hessian, change = ca.MX.zeros(n), ca.MX.zeros(n, n), ca.MX(0)
     steps, gains, curvatures = [ca.MX()] * t, [ca.MX()] * t, []
     for i in reversed(range(t)):
         gradient, hessian, steps[i], gains[i], gain, curvature = one(
-            gradient, hessian, x[:, i], u[:, i], p[:, i], low[:, i], high[:, i], exact, mu
+            gradient, hessian, x[:, i], u[:, i], p[:, i], *[b[:, i] for b in bounds], exact, mu
         )
         change += gain
         curvatures.append(curvature)
     outputs = [ca.horzcat(*steps), ca.horzcat(*gains), change, ca.mmin(ca.vertcat(*curvatures))]
-    return ca.Function("backward", [x, u, p, low, high, exact, mu], outputs)
+    return ca.Function("backward", [x, u, p, *bounds, exact, mu], outputs)
+
+
+def _trajectory(stage: Stage, t: int) -> list[Any]:
+    """Symbols x, u, p and low, high, most: one column per stage."""
+    sizes = (N_STATES, 2, stage.parameters.shape[0], 2, 2, 2)
+    columns = (t + 1, t, t, t, t, t)
+    names = ("x", "u", "p", "low", "high", "most")
+    return [ca.MX.sym(*shape) for shape in zip(names, sizes, columns, strict=True)]
 
 
 def _riccati_step(stage: Stage, settings: PlannerSettings) -> Any:
     """One stage of the backward pass: the cost-to-go before it, from the one after it."""
-    gradient, hessian = ca.SX.sym("gradient", 4), ca.SX.sym("hessian", 4, 4)
-    low, high, exact, mu = (ca.SX.sym(n, k) for n, k in (("l", 2), ("h", 2), ("e", 1), ("m", 1)))
+    n = N_STATES
+    gradient, hessian = ca.SX.sym("gradient", n), ca.SX.sym("hessian", n, n)
+    low, high, most = (ca.SX.sym(name, 2) for name in ("low", "high", "most"))
+    exact, mu = ca.SX.sym("exact"), ca.SX.sym("mu")
     z = ca.vertcat(stage.state, stage.control)
     # Exact: the dynamics' own curvature, weighted by the cost-to-go, belongs to it (DDP).
     newton, _ = ca.hessian(stage.cost + ca.dot(gradient, stage.next_state), z)
     jacobian = ca.jacobian(stage.residuals, z)
-    gauss_newton = jacobian.T @ (ca.repmat(stage.residual_weights, 1, 6) * jacobian)
+    gauss_newton = jacobian.T @ (ca.repmat(stage.residual_weights, 1, n + 2) * jacobian)
     move = ca.jacobian(stage.next_state, z)
     model = exact * newton + (1.0 - exact) * gauss_newton + move.T @ hessian @ move
     slope = ca.gradient(stage.cost, z) + move.T @ gradient
-    xx, ux, uu = model[:4, :4], model[4:, :4], model[4:, 4:]
-    x_slope, u_slope = slope[:4], slope[4:]
+    xx, ux, uu = model[:n, :n], model[n:, :n], model[n:, n:]
+    x_slope, u_slope = slope[:n], slope[n:]
 
     damped = uu + mu * ca.SX.eye(2)
-    stop = standstill(stage.state, settings)
-    stops = stop > low[1]
-    below = ca.vertcat(low[0], ca.fmax(low[1], stop)) - stage.control
-    step, free = _box_step(damped, u_slope, below, high - stage.control)
-    gain = _gain(damped, ux, free)
-    # Held at standstill: braking less hard from a lower speed is part of the policy.
-    held = ca.logic_and(ca.logic_and(stops, ca.logic_not(free[1])), step[1] <= below[1] + 1e-9)
-    gain[1, 3] = ca.if_else(held, ca.gradient(stop, stage.state)[3], gain[1, 3])
+    limits = control_limits(stage.state, low, high, most, settings)
+    below, above = (limit - stage.control for limit in limits)
+    step, free = _box_step(damped, u_slope, below, above)
+    # What is held at a limit moves with it: the limits depend on the state.
+    slopes = [ca.jacobian(limit, stage.state) for limit in limits]
+    at_lowest = [step[i] <= below[i] + _AT_LIMIT for i in range(2)]
+    held = [ca.if_else(at_lowest[i], slopes[0][i, :], slopes[1][i, :]) for i in range(2)]
+    gain = _gain(damped, ux, free, held)
     gradient_before = x_slope + gain.T @ (uu @ step + u_slope) + ux.T @ step
     hessian_before = xx + gain.T @ uu @ gain + gain.T @ ux + ux.T @ gain
     change = ca.dot(step, u_slope) + 0.5 * ca.dot(step, uu @ step)
     return ca.Function(
         "riccati",
-        [gradient, hessian, stage.state, stage.control, stage.parameters, low, high, exact, mu],
+        [gradient, hessian, *_stage_inputs(stage), low, high, most, exact, mu],
         [
             gradient_before,
             0.5 * (hessian_before + hessian_before.T),
@@ -238,6 +253,10 @@ def _riccati_step(stage: Stage, settings: PlannerSettings) -> Any:
         ],
         {"cse": True},
     )
+
+
+def _stage_inputs(stage: Stage) -> list[Any]:
+    return [stage.state, stage.control, stage.parameters]
 
 
 def _box_step(h: Any, g: Any, low: Any, high: Any) -> tuple[Any, list[Any]]:
@@ -262,16 +281,23 @@ def _box_step(h: Any, g: Any, low: Any, high: Any) -> tuple[Any, list[Any]]:
         lower = value(other) < cost
         side, cost = ca.if_else(lower, other, side), ca.if_else(lower, value(other), cost)
     step = ca.if_else(inside, best, side)
-    free = [ca.logic_and(step[i] > low[i] + 1e-12, step[i] < high[i] - 1e-12) for i in range(2)]
+    free = [
+        ca.logic_and(step[i] > low[i] + _AT_LIMIT, step[i] < high[i] - _AT_LIMIT) for i in range(2)
+    ]
     return step, free
 
 
-def _gain(h: Any, ux: Any, free: list[Any]) -> Any:
-    """Feedback of the free controls on the state: (2, 4); what is at a bound stays there."""
-    both = ca.logic_and(*free)
-    coupled = _solve_2x2(h, -ux)
-    alone = [ca.if_else(free[i], -ux[i, :] / h[i, i], 0) for i in range(2)]
-    return ca.vertcat(*[ca.if_else(both, coupled[i, :], alone[i]) for i in range(2)])
+def _gain(h: Any, ux: Any, free: list[Any], held: list[Any]) -> Any:
+    """Feedback of the controls on the state, (2, n): free ones as is best, held ones as given.
+
+    A free one answers to what the held one does.
+    """
+    both, coupled = ca.logic_and(*free), _solve_2x2(h, -ux)
+    rows = []
+    for i in range(2):
+        alone = -(ux[i, :] + h[0, 1] * held[1 - i]) / h[i, i]
+        rows.append(ca.if_else(both, coupled[i, :], ca.if_else(free[i], alone, held[i])))
+    return ca.vertcat(*rows)
 
 
 def _solve_2x2(h: Any, b: Any) -> Any:
@@ -287,23 +313,21 @@ def _least_eigenvalue(h: Any) -> Any:
 
 
 def _forward_pass(stage: Stage, settings: PlannerSettings) -> Any:
-    """(x, u, p, low, high, steps, gains, length) -> (new x, new u, terms summed over stages)."""
-    one = stopping_stage(stage, settings)
-    t = settings.horizon
-    x, u = ca.MX.sym("x", 4, t + 1), ca.MX.sym("u", 2, t)
-    p = ca.MX.sym("p", stage.parameters.shape[0], t)
-    low, high = ca.MX.sym("low", 2, t), ca.MX.sym("high", 2, t)
-    steps, gains, length = ca.MX.sym("steps", 2, t), ca.MX.sym("gains", 2, 4 * t), ca.MX.sym("a")
+    """(x, u, p, low, high, most, steps, gains, length) -> (new x, new u, terms, summed)."""
+    one = limited_stage(stage, settings)
+    t, n = settings.horizon, N_STATES
+    x, u, p, *bounds = _trajectory(stage, t)
+    steps, gains, length = ca.MX.sym("steps", 2, t), ca.MX.sym("gains", 2, n * t), ca.MX.sym("a")
     states, controls, total = [x[:, 0]], [], ca.MX.zeros(len(TERMS))
     for i in range(t):
-        feedback = gains[:, 4 * i : 4 * i + 4] @ (states[-1] - x[:, i])
+        feedback = gains[:, n * i : n * i + n] @ (states[-1] - x[:, i])
         wanted = u[:, i] + length * steps[:, i] + feedback
-        state, control, terms = one(states[-1], wanted, p[:, i], low[:, i], high[:, i])
+        state, control, terms = one(states[-1], wanted, p[:, i], *[b[:, i] for b in bounds])
         states.append(state)
         controls.append(control)
         total += terms
     return ca.Function(
         "forward",
-        [x, u, p, low, high, steps, gains, length],
+        [x, u, p, *bounds, steps, gains, length],
         [ca.horzcat(*states), ca.horzcat(*controls), total],
     )

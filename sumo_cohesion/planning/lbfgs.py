@@ -13,10 +13,11 @@ from sumo_cohesion.planning.problem import Guess, Instance, Solution
 from sumo_cohesion.planning.settings import PlannerSettings
 from sumo_cohesion.planning.stage import (
     CONTROL_SCALE,
+    N_STATES,
     TERMS,
     StageParameters,
+    limited_stage,
     make_stage,
-    stopping_stage,
 )
 from sumo_cohesion.state import FloatArray
 
@@ -29,34 +30,36 @@ class Lbfgs:
     def __init__(self, settings: PlannerSettings, n_lanes: int) -> None:
         self._settings = settings
         parameters = StageParameters(settings, n_lanes)
-        one = stopping_stage(make_stage(settings, parameters), settings)
+        one = limited_stage(make_stage(settings, parameters), settings)
         t = settings.horizon
-        ego, u = ca.MX.sym("ego", 4), ca.MX.sym("u", 2, t)
-        p = ca.MX.sym("p", parameters.size, t)
-        state, total, states, driven = ego, ca.MX.zeros(len(TERMS)), [ego], []
+        start, u = ca.MX.sym("start", N_STATES), ca.MX.sym("u", 2, t)
+        p, most = ca.MX.sym("p", parameters.size, t), ca.MX.sym("most", 2, t)
+        state, total, states, driven = start, ca.MX.zeros(len(TERMS)), [start], []
         for i in range(t):
-            state, control, gained = one(state, u[:, i], p[:, i], -ca.inf, ca.inf)
+            state, control, gained = one(state, u[:, i], p[:, i], -ca.inf, ca.inf, most[:, i])
             states.append(state)
             driven.append(control)
             total += gained
         cost = -ca.sum1(total)
         function = ca.Function(
             "cost",
-            [ego, u, p],
+            [start, u, p, most],
             [cost, ca.gradient(cost, u), ca.horzcat(*states), ca.horzcat(*driven), total],
         )
         (function,), self.how = compiled([function])
-        self._ego, self._u, self._p = np.zeros(4), np.zeros((t, 2)), np.zeros((t, p.shape[0]))
+        self._start, self._p = np.zeros(N_STATES), np.zeros((t, p.shape[0]))
+        self._u, self._most = np.zeros((t, 2)), np.zeros((t, 2))
         self._cost, self._gradient = np.zeros(1), np.zeros((t, 2))
-        self._states, self._driven = np.zeros((t + 1, 4)), np.zeros((t, 2))
+        self._states, self._driven = np.zeros((t + 1, N_STATES)), np.zeros((t, 2))
         self._terms = np.zeros(len(TERMS))
         outputs = [self._cost, self._gradient, self._states, self._driven, self._terms]
-        self._run = BoundCall(function, [self._ego, self._u, self._p], outputs)
+        self._run = BoundCall(function, [self._start, self._u, self._p, self._most], outputs)
 
     def solve(self, instance: Instance, guess: Guess) -> Solution:
         """Solve from a guess of the controls; the guess of the states is not needed."""
         start = time.perf_counter()
-        self._p[:], self._ego[:] = instance.stages, instance.ego
+        self._p[:], self._start[:] = instance.stages, instance.start
+        self._most[:] = instance.change
         low, high = instance.low.ravel().tolist(), instance.high.ravel().tolist()
         first = np.clip(guess.controls / CONTROL_SCALE, instance.low, instance.high)
         result = minimize(
@@ -71,7 +74,7 @@ class Lbfgs:
         # A line search that ends at the limits of the arithmetic is no failure.
         solved = bool(np.isfinite(result.fun)) and result.status in (0, 2)
         return Solution(
-            states=self._states.copy(),
+            states=self._states[:, :4].copy(),
             controls=self._driven * CONTROL_SCALE,
             solved=solved,
             status="solved" if solved else f"{self.name} returned {result.message}",

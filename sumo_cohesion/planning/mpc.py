@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
+from functools import lru_cache, partial
 from typing import Protocol
 
 import numpy as np
@@ -19,7 +19,8 @@ from sumo_cohesion.planning.lbfgs import Lbfgs
 from sumo_cohesion.planning.nlp import InteriorPoint
 from sumo_cohesion.planning.problem import Guess, Instance, Problem, Solution
 from sumo_cohesion.planning.settings import PlannerSettings
-from sumo_cohesion.planning.stage import StageParameters, control_bounds
+from sumo_cohesion.planning.stage import StageParameters, make_instance
+from sumo_cohesion.state import FloatArray
 
 
 class Solver(Protocol):
@@ -40,6 +41,12 @@ SOLVERS: dict[str, Callable[[PlannerSettings, int], Solver]] = {
 }
 
 
+@lru_cache(maxsize=32)
+def shared_solver(name: str, settings: PlannerSettings, n_lanes: int) -> Solver:
+    """Return a solver, built once per process: it remembers nothing between two solves."""
+    return SOLVERS[name](settings, n_lanes)
+
+
 class Mpc:
     """The controller for roads of up to ``n_lanes`` lanes.
 
@@ -51,8 +58,7 @@ class Mpc:
     def __init__(self, settings: PlannerSettings, n_lanes: int) -> None:
         self.settings = settings
         self.n_lanes = n_lanes
-        self.solver = SOLVERS[settings.solver](settings, n_lanes)
-        self._second: Solver | None = None
+        self.solver = shared_solver(settings.solver, settings, n_lanes)
         self._parameters = StageParameters(settings, n_lanes)
         self._stages = np.zeros((settings.horizon, self._parameters.size))
         self._warm: Guess | None = None
@@ -61,6 +67,11 @@ class Mpc:
     def how(self) -> str:
         """Which solver, and whether it is compiled."""
         return f"{self.solver.name}, {self.solver.how}"
+
+    @property
+    def expected_lateral(self) -> FloatArray | None:
+        """Where across the road (m) the last solution is from now on, (T + 1,)."""
+        return None if self._warm is None else self._warm.states[:, 1]
 
     def reset(self) -> None:
         """Forget the last solution."""
@@ -73,8 +84,7 @@ class Mpc:
             # Some solvers never return from a problem that is not a number.
             empty = np.zeros((0, 0))
             return Solution(empty, empty, False, "input is not finite", 0, 0.0, {})
-        bounds = control_bounds(self.settings, float(problem.ego[3]))
-        instance = Instance(problem.ego, self._stages, *bounds)
+        instance = make_instance(problem, self._stages, self.settings)
         solution = self.solver.solve(instance, self._warm or self._hold(problem))
         if not solution.solved:
             solution = self._rescued(instance, self._hold(problem), solution)
@@ -82,10 +92,8 @@ class Mpc:
         return solution
 
     def _rescued(self, instance: Instance, guess: Guess, failed: Solution) -> Solution:
-        """Try IPOPT, slower and sturdier; built when it is first needed."""
-        if self._second is None:
-            self._second = SOLVERS["ipopt"](self.settings, self.n_lanes)
-        second = self._second.solve(instance, guess)
+        """Try IPOPT, slower and sturdier."""
+        second = shared_solver("ipopt", self.settings, self.n_lanes).solve(instance, guess)
         return replace(
             second,
             status="rescued by ipopt" if second.solved else f"{failed.status}; {second.status}",

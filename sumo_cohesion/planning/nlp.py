@@ -16,9 +16,11 @@ from sumo_cohesion.planning.problem import Guess, Instance, Solution
 from sumo_cohesion.planning.settings import PlannerSettings
 from sumo_cohesion.planning.stage import (
     CONTROL_SCALE,
+    N_STATES,
     TERMS,
     StageParameters,
     make_stage,
+    standstill,
 )
 from sumo_cohesion.state import FloatArray
 
@@ -37,31 +39,43 @@ class InteriorPoint:
         terms = ca.vertcat(*[stage.terms[term] for term in TERMS])
         inputs = [stage.state, stage.control, stage.parameters]
         one = ca.Function("stage", inputs, [stage.next_state, terms])
-        ego, p = ca.SX.sym("ego", 4), ca.SX.sym("p", layout.size, horizon)
-        states = [ca.SX.sym(f"x{t}", 4) for t in range(horizon + 1)]
+        start, p = ca.SX.sym("start", N_STATES), ca.SX.sym("p", layout.size, horizon)
+        change = ca.SX.sym("change", 2, horizon)
+        states = [ca.SX.sym(f"x{t}", N_STATES) for t in range(horizon + 1)]
         controls = [ca.SX.sym(f"u{t}", 2) for t in range(horizon)]
         unknowns, constraints, total = [], [], ca.SX.zeros(len(TERMS))
+        equality: list[bool] = []
         for t in range(horizon):
             stepped, gained = one(states[t], controls[t], p[:, t])
             unknowns += [states[t], controls[t]]
             constraints.append(states[t + 1] - stepped)
+            equality += [True] * N_STATES
             if t == 0:
-                constraints.append(states[0] - ego)
+                constraints.append(states[0] - start)
+                equality += [True] * N_STATES
+            # Not positive: how much more than it may a control differs from the one before.
+            last, most = states[t][4:], change[:, t]
+            highest = ca.vertcat(
+                last[0] + most[0], ca.fmax(last[1] + most[1], standstill(states[t], settings))
+            )
+            constraints += [last - most - controls[t], controls[t] - highest]
+            equality += [False] * 4
             total += gained
         unknowns.append(states[horizon])
         z, g = ca.vertcat(*unknowns), ca.vertcat(*constraints)
-        parameters = ca.vertcat(ego, ca.vec(p))
+        parameters = ca.vertcat(start, ca.vec(p), ca.vec(change))
         nlp = {"x": z, "p": parameters, "f": -ca.sum1(total), "g": g}
-        self._solver = ca.nlpsol(name, name, nlp, self._options(g.shape[0]))
+        self._solver = ca.nlpsol(name, name, nlp, self._options(equality))
+        self._lowest = np.where(equality, 0.0, -np.inf)
         self._terms = ca.Function("terms", [z, parameters], [total])
 
-    def _options(self, n_constraints: int) -> dict[str, Any]:
+    def _options(self, equality: list[bool]) -> dict[str, Any]:
         common: dict[str, Any] = {"print_time": False, "error_on_fail": False}
         iterations = self._settings.max_iterations
         if self.name == "fatrop":
             return common | {
                 "structure_detection": "auto",
-                "equality": [True] * n_constraints,
+                "equality": equality,
                 "fatrop.print_level": 0,
                 "fatrop.max_iter": iterations,
             }
@@ -70,10 +84,12 @@ class InteriorPoint:
     def solve(self, instance: Instance, guess: Guess) -> Solution:
         """Solve from a guess; never raises for the solver's failure, see ``solved``."""
         start = time.perf_counter()
-        parameters = np.concatenate((instance.ego, instance.stages.ravel()))
+        parameters = np.concatenate(
+            (instance.start, instance.stages.ravel(), instance.change.ravel())
+        )
         lower, upper = self._bounds(instance)
-        x0 = self._pack(guess.states, guess.controls)
-        result = self._solver(x0=x0, p=parameters, lbx=lower, ubx=upper, lbg=0.0, ubg=0.0)
+        x0 = self._pack(instance, guess)
+        result = self._solver(x0=x0, p=parameters, lbx=lower, ubx=upper, lbg=self._lowest, ubg=0.0)
         stats = self._solver.stats()
         z = np.asarray(result["x"]).ravel()
         solved = bool(stats["success"]) and bool(np.isfinite(z.sum()))
@@ -94,19 +110,22 @@ class InteriorPoint:
 
     def _bounds(self, instance: Instance) -> tuple[FloatArray, FloatArray]:
         """Bounds on the unknowns: those of the controls, and no reversing."""
-        horizon, free = self._settings.horizon, np.full(4, np.inf)
-        forwards = np.array([-np.inf, -np.inf, -np.inf, 0.0])
+        horizon, free = self._settings.horizon, np.full(N_STATES, np.inf)
+        forwards = -free
+        forwards[3] = 0.0
         rows = np.hstack((np.tile(forwards, (horizon, 1)), instance.low))
         lower = np.concatenate((rows.ravel(), forwards))
         # The present state is given: a bound that it lies on would leave no interior.
-        lower[:4] = -np.inf
+        lower[:N_STATES] = -np.inf
         rows = np.hstack((np.tile(free, (horizon, 1)), instance.high))
         return lower, np.concatenate((rows.ravel(), free))
 
-    def _pack(self, states: FloatArray, controls: FloatArray) -> FloatArray:
-        rows = np.hstack((states[:-1], controls / CONTROL_SCALE))
-        return np.concatenate((rows.ravel(), states[-1]))
+    def _pack(self, instance: Instance, guess: Guess) -> FloatArray:
+        controls = guess.controls / CONTROL_SCALE
+        states = np.hstack((guess.states, np.vstack((instance.start[4:], controls))))
+        return np.concatenate((np.hstack((states[:-1], controls)).ravel(), states[-1]))
 
     def _unpack(self, z: FloatArray) -> tuple[FloatArray, FloatArray]:
-        rows = z[:-4].reshape(self._settings.horizon, 6)
-        return np.vstack((rows[:, :4], z[-4:])), rows[:, 4:] * CONTROL_SCALE
+        rows = z[:-N_STATES].reshape(self._settings.horizon, N_STATES + 2)
+        states = np.vstack((rows[:, :N_STATES], z[-N_STATES:]))
+        return states[:, :4], rows[:, N_STATES:] * CONTROL_SCALE

@@ -71,6 +71,7 @@ class CohesivePlanner:
         self._theta = np.array(list(settings.reward.model_dump().values()))
         self._election = Election(cohesion)
         self._mpc: Mpc | None = None
+        self._driven: Control | None = None
         # Where the horizon is asked for the others' place: every third step is dense enough.
         self._place_steps = list(range(1, settings.horizon + 1, 3))
 
@@ -84,6 +85,7 @@ class CohesivePlanner:
             self._mpc = Mpc(self.settings, n_lanes)
         self._mpc.reset()
         self._election.reset()
+        self._driven = None
 
     def plan(self, observation: Observation, history: History) -> Plan:
         """Plan one step, in the paper's order."""
@@ -100,6 +102,7 @@ class CohesivePlanner:
         # 5. Never a plan without a way out: visible cars come before whatever was agreed.
         if self.settings.last_resort:
             plan = checked(plan, observation, self._road, self.settings)
+        self._driven = plan.controls[0]
         return replace(plan, social_time=social_time, solver=self._mpc.how)
 
     def _agreement(
@@ -123,16 +126,19 @@ class CohesivePlanner:
         horizon, ego = self.settings.horizon, observation.ego
         # Where the ego will be if it keeps its speed: the road is looked up there.
         s: FloatArray = ego.s + DT * ego.speed * np.arange(horizon + 1.0)
-        ahead = self._road.ahead(s, ego.d)
+        assert self._mpc is not None
+        expected = self._mpc.expected_lateral
+        ahead = self._road.ahead(s, ego.d if expected is None else expected)
         lanes, widths = ahead.lanes[:, 1:], ahead.widths[:, 1:]
         missing = np.isinf(lanes)
         weight = np.zeros((len(FEATURES), horizon))
         target = np.zeros((len(FEATURES), horizon))
         if groups:
             # The paper's cohesion is on the first transition.
+            stages = slice(1 if self.cohesion.transitions == "first" else None)
             term = combine(groups)
-            weight[:, 0] = self.cohesion.beta * np.array(term.weight)
-            target[:, 0] = term.target
+            weight[:, stages] = self.cohesion.beta * np.array(term.weight)[:, None]
+            target[:, stages] = np.array(term.target)[:, None]
         place_weight, place_target = self._place(place)
         # The more, the more cohesion could win by coming too close.
         pressure = float(weight.sum() + place_weight.sum() * PLACE_SCALE**2)
@@ -152,6 +158,7 @@ class CohesivePlanner:
             place_weight=place_weight,
             place_target=place_target,
             constraint_weight=np.array([self.settings.constraint * (1.0 + pressure)]),
+            driven=self._driven,
         )
 
     def _place(self, place: Place) -> tuple[FloatArray, FloatArray]:

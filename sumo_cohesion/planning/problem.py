@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from sumo_cohesion.state import FloatArray
+from sumo_cohesion.state import Control, FloatArray
 
 FAR_AWAY = 1e4
 """Metres at which lanes and cars that do not exist are put: their Gaussians are zero there."""
@@ -27,6 +27,8 @@ class Problem:
     cohesion_weight, cohesion_target : (k, T), beta included; zero weights: not cohesive.
     place_weight, place_target : (T,) per m², beta included, and m: where across the road.
     constraint_weight : (1,) per m beyond a constraint.
+    driven : the control of the step before, from which this one's may differ by so much; None if
+        there is none to differ from.
     """
 
     ego: FloatArray
@@ -44,6 +46,7 @@ class Problem:
     place_weight: FloatArray
     place_target: FloatArray
     constraint_weight: FloatArray
+    driven: Control | None = None
 
 
 @dataclass(frozen=True)
@@ -52,15 +55,17 @@ class Instance:
 
     Attributes
     ----------
-    ego : (4,) road state.
+    start : (6,) road state and the scaled control of the step before.
     stages : (T, n) parameters of every stage, see stage.StageParameters.
     low, high : (T, 2) bounds on the scaled controls.
+    change : (T, 2) bounds on their change from the control before.
     """
 
-    ego: FloatArray
+    start: FloatArray
     stages: FloatArray
     low: FloatArray
     high: FloatArray
+    change: FloatArray
 
 
 @dataclass(frozen=True)

@@ -44,7 +44,8 @@ def checked(plan: Plan, observation: Observation, road: Road, settings: PlannerS
     # The curvature with which the ego goes parallel to the road after one step.
     level = bend * cos(ego.heading) / (1.0 - bend * ego.d)
     level -= ego.heading / (DT * max(after[3], 1.0))
-    level = min(max(level, -settings.max_curvature), settings.max_curvature)
+    sharpest = settings.sharpest(ego.speed)
+    level = min(max(level, -sharpest), sharpest)
     hardest = settings.friction * ego.speed - min(settings.max_braking, ego.speed / DT)
     curvature, acceleration, reasons = control.curvature, control.acceleration, []
     own = _extent(ego.heading, observation.ego_size)

@@ -40,9 +40,12 @@ class PlannerSettings(BaseModel):
     horizon : steps of 0.1 s.
     friction : linear friction (1/s) of the point mass.
     max_curvature : bound (1/m) on the driven path's curvature.
+    max_lateral_acceleration : bound (m/s²) on speed² · curvature.
+    max_curvature_rate : bound (1/m/s) on how fast the curvature changes.
     max_braking, max_acceleration : bounds (m/s²) on the change of speed.
-    constraint : cost per metre too close to a visible car (planning.constraints), in units of what
-        cohesion could win by it.
+    max_jerk : bound (m/s³) on how fast the commanded acceleration changes.
+    constraint : cost per metre too close to a visible car or beyond the road's edge
+        (planning.constraints), in units of what cohesion could win by it.
     cars : how many of the nearest vehicles are avoided.
     solver : ilqr (planning.ilqr), the fast one; fatrop and ipopt, CasADi's interior point methods;
         lbfgs, the paper's own.
@@ -56,11 +59,18 @@ class PlannerSettings(BaseModel):
     horizon: Annotated[int, Field(ge=1, le=100)] = 10
     friction: NonNegative = 0.1
     max_curvature: Positive = 0.01
+    max_lateral_acceleration: Positive = 8.0
+    max_curvature_rate: Positive = 0.05
     max_braking: Positive = 8.0
     max_acceleration: Positive = 4.8
+    max_jerk: Positive = 100.0
     constraint: NonNegative = 20.0
     cars: Annotated[int, Field(ge=1, le=100)] = 8
     solver: Literal["ilqr", "fatrop", "ipopt", "lbfgs"] = "ilqr"
     max_iterations: Annotated[int, Field(ge=1)] = 100
     last_resort: bool = True
     reward: RewardWeights = RewardWeights()
+
+    def sharpest(self, speed: float) -> float:
+        """Largest curvature (1/m) at a speed (m/s): the car's, or its tyres'."""
+        return min(self.max_curvature, self.max_lateral_acceleration / max(speed, 1e-3) ** 2)

@@ -13,19 +13,24 @@ import numpy as np
 
 from sumo_cohesion.planning import constraints, dynamics, reward
 from sumo_cohesion.planning.dynamics import DT
-from sumo_cohesion.planning.problem import Problem
+from sumo_cohesion.planning.problem import Instance, Problem
 from sumo_cohesion.planning.settings import PlannerSettings, RewardWeights
 from sumo_cohesion.social.features import FEATURES, social_features
 from sumo_cohesion.state import FloatArray
 
 CONTROL_SCALE = np.array([0.01, 5.0])
 """Curvature (1/m) and acceleration (m/s²) that solvers see as one."""
+N_STATES = 6
+UNLIMITED = 1e6
+"""Change of a scaled control that no bound stands against."""
 TERMS = (*RewardWeights.model_fields, "cohesion", "constraints")
 """Names of the parts of a stage's reward."""
 
 
 class Stage(NamedTuple):
-    """Expressions of one stage in ``state`` (4), ``control`` (2, scaled) and ``parameters``.
+    """Expressions of one stage in ``state`` (6), ``control`` (2, scaled) and ``parameters``.
+
+    The state is the road state and the scaled control of the stage before.
 
     ``residuals`` r and ``residual_weights`` w say the same cost as a weighted sum of squares, in
     the sense that its gradient is J'(w r) and J' diag(w) J is positive semidefinite: what a
@@ -90,10 +95,10 @@ class StageParameters:
 
 def make_stage(settings: PlannerSettings, parameters: StageParameters) -> Stage:
     """Write down one stage."""
-    state, control = ca.SX.sym("state", 4), ca.SX.sym("control", 2)
+    state, control = ca.SX.sym("state", N_STATES), ca.SX.sym("control", 2)
     p = parameters.symbols()
     physical = [control[i] * float(CONTROL_SCALE[i]) for i in range(2)]
-    before = ca.vertsplit(state)
+    before = ca.vertsplit(state)[:4]
     after = dynamics.step(before, physical, DT, settings.friction, p["road_curvature"])
     inputs = reward.StageInputs(
         lanes=p["lanes"],
@@ -111,7 +116,7 @@ def make_stage(settings: PlannerSettings, parameters: StageParameters) -> Stage:
     psi = ca.vertcat(*social_features(before, after, DT, p["road_curvature"]))
     missed, aside = psi - p["cohesion_target"], after[1] - p["place_target"]
     terms["cohesion"] = -ca.dot(p["cohesion_weight"], missed**2) - p["place_weight"] * aside**2
-    violation = constraints.violations(after, inputs)
+    violation = constraints.violations(after, inputs, p["ego_width"])
     terms["constraints"] = -p["constraint_weight"] * ca.sum1(constraints.penalties(violation))
     rows = reward.squares(after, physical, inputs, p["ego_width"])
     pairs = [(r, theta[name] * w) for name in rows for r, w in rows[name]]
@@ -122,21 +127,44 @@ def make_stage(settings: PlannerSettings, parameters: StageParameters) -> Stage:
         state,
         control,
         ca.vertcat(*p.values()),
-        ca.vertcat(*after),
+        ca.vertcat(*after, control),
         terms,
         ca.vertcat(*residuals),
         ca.vertcat(*weights),
     )
 
 
-def control_bounds(settings: PlannerSettings, speed: float) -> tuple[FloatArray, FloatArray]:
-    """Lowest and highest scaled controls of every stage, (T, 2) each, at a speed (m/s).
+def make_instance(problem: Problem, stages: FloatArray, settings: PlannerSettings) -> Instance:
+    """Put a problem into the solvers' numbers; ``stages`` are its filled parameters."""
+    low, high = control_bounds(settings, float(problem.ego[3]))
+    change = np.empty_like(low)
+    change[:] = (settings.max_curvature_rate, settings.max_jerk)
+    change *= DT / CONTROL_SCALE
+    start = np.zeros(N_STATES)
+    start[:4] = problem.ego
+    if problem.driven is None:
+        change[0] = UNLIMITED
+    else:
+        # What was driven under other bounds, at another speed, must not leave nothing to choose.
+        driven = np.array(problem.driven) / CONTROL_SCALE
+        start[4:] = np.minimum(np.maximum(driven, low[0]), high[0])
+    return Instance(start, stages, low, high, change)
 
-    Braking and acceleration are bounded as what they do to the speed, friction included.
+
+def control_bounds(settings: PlannerSettings, speed: float) -> tuple[FloatArray, FloatArray]:
+    """Lowest and highest scaled controls of every stage, (T, 2) each, from a speed (m/s).
+
+    Braking and acceleration are bounded as what they do to the speed, friction included. Curvature
+    is bounded so that the lateral acceleration keeps to its bound however fast the ego may be by
+    then.
     """
-    drag, bend = settings.friction * speed, settings.max_curvature
-    low = np.tile((-bend, drag - settings.max_braking), (settings.horizon, 1))
-    high = np.tile((bend, drag + settings.max_acceleration), (settings.horizon, 1))
+    fastest = speed + DT * settings.max_acceleration * np.arange(settings.horizon)
+    drag = settings.friction * speed
+    low, high = np.empty((settings.horizon, 2)), np.empty((settings.horizon, 2))
+    high[:, 0] = settings.max_lateral_acceleration / np.maximum(fastest, 1e-3) ** 2
+    np.minimum(high[:, 0], settings.max_curvature, out=high[:, 0])
+    low[:, 0] = -high[:, 0]
+    low[:, 1], high[:, 1] = drag - settings.max_braking, drag + settings.max_acceleration
     return low / CONTROL_SCALE, high / CONTROL_SCALE
 
 
@@ -145,19 +173,36 @@ def standstill(state: Any, settings: PlannerSettings) -> Any:
     return (settings.friction - 1.0 / DT) * state[3] / float(CONTROL_SCALE[1])
 
 
-def stopping_stage(stage: Stage, settings: PlannerSettings) -> Any:
-    """(state, control, parameters, low, high) -> (next state, control as driven, terms).
+def control_limits(
+    state: Any, low: Any, high: Any, change: Any, settings: PlannerSettings
+) -> tuple[Any, Any]:
+    """Lowest and highest scaled control of a stage that starts in a state; symbols, two each.
 
-    The control is kept within its bounds, and no car reverses.
+    The stage's own bounds come before those of the change, and standing still before both: who
+    has stopped no longer brakes.
     """
-    low, high = ca.SX.sym("low", 2), ca.SX.sym("high", 2)
-    lowest = ca.vertcat(low[0], ca.fmax(low[1], standstill(stage.state, settings)))
-    control = ca.fmin(ca.fmax(stage.control, lowest), high)
+    last, stop = state[4:], standstill(state, settings)
+    lowest = ca.fmin(ca.fmax(low, last - change), high)
+    highest = ca.fmax(ca.fmin(high, last + change), low)
+    return (
+        ca.vertcat(lowest[0], ca.fmax(lowest[1], stop)),
+        ca.vertcat(highest[0], ca.fmax(highest[1], stop)),
+    )
+
+
+def limited_stage(stage: Stage, settings: PlannerSettings) -> Any:
+    """(state, control, parameters, low, high, change) -> (next state, control as driven, terms).
+
+    The control is kept within its limits.
+    """
+    low, high, change = ca.SX.sym("low", 2), ca.SX.sym("high", 2), ca.SX.sym("change", 2)
+    lowest, highest = control_limits(stage.state, low, high, change, settings)
+    control = ca.fmin(ca.fmax(stage.control, lowest), highest)
     terms = ca.vertcat(*[stage.terms[name] for name in TERMS])
     after = ca.substitute([stage.next_state, terms], [stage.control], [control])
     return ca.Function(
         "stage",
-        [stage.state, stage.control, stage.parameters, low, high],
+        [stage.state, stage.control, stage.parameters, low, high, change],
         [after[0], control, after[1]],
         {"cse": True},
     )

@@ -17,6 +17,8 @@ class CohesionSettings(BaseModel):
     ----------
     beta : trade-off between the ego's own reward and cohesion (paper, eq. 2); only its ratio
         to the reward weights matters. Zero is the nominal planner.
+    transitions : on which of the plan's transitions cohesion acts: on the "first", as in the paper,
+        or on "all" of the horizon.
     variance_floor : added to the sample variance of a normalised feature, so that perfect
         agreement has a finite weight.
     min_cars : fewest cars that can agree; one car always agrees with itself.
@@ -43,6 +45,7 @@ class CohesionSettings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     beta: NonNegative = 0.09
+    transitions: Literal["first", "all"] = "first"
     variance_floor: Positive = 2.5e-3
     min_cars: Annotated[int, Field(ge=2)] = 2
     lateral_votes: Literal["all", "most_surprising"] = "most_surprising"
@@ -68,6 +71,7 @@ def as_printed(cohesion: CohesionSettings) -> CohesionSettings:
     Every group votes on every feature, transitions span one step, nothing is added.
     """
     printed = {
+        "transitions": "first",
         "lateral_votes": "all",
         "place_weight": 0.0,
         "habit": 0.0,

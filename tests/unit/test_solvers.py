@@ -19,9 +19,15 @@ from sumo_cohesion.planning import compiled as compilation
 from sumo_cohesion.planning.dynamics import step
 from sumo_cohesion.planning.ilqr import _box_step
 from sumo_cohesion.planning.mpc import SOLVERS, Mpc
-from sumo_cohesion.planning.problem import FAR_AWAY, Problem
+from sumo_cohesion.planning.problem import FAR_AWAY, Problem, Solution
 from sumo_cohesion.planning.settings import PlannerSettings
-from sumo_cohesion.planning.stage import StageParameters, make_stage
+from sumo_cohesion.planning.stage import (
+    CONTROL_SCALE,
+    StageParameters,
+    control_bounds,
+    make_stage,
+)
+from sumo_cohesion.state import Control
 from tests.conftest import ROOT
 
 SETTINGS = PlannerSettings()
@@ -59,6 +65,7 @@ def problem(seed: int, horizon: int = 10, cohesion: float = 1.0) -> Problem:
         place_weight=np.full(t, cohesion * rng.uniform(0.0, 5.0)),
         place_target=rng.uniform(-4.0, 4.0) + np.zeros(t),
         constraint_weight=np.array([20.0 * (1.0 + weight.sum())]),
+        driven=Control(rng.uniform(-0.01, 0.01), rng.uniform(-8.0, 4.8)) if seed % 2 else None,
     )
 
 
@@ -100,7 +107,7 @@ def test_squares_have_the_gradient_of_the_cost_and_are_never_negative() -> None:
         instance = problem(seed)
         rows = np.zeros((10, parameters.size))
         parameters.fill(instance, rows)
-        control = np.random.default_rng(seed).normal(size=2)
+        control = np.random.default_rng(seed).normal(size=4)
         exact, squares, weights = (
             np.asarray(value).ravel()
             for value in function(np.concatenate((instance.ego, control)), rows[0])
@@ -136,12 +143,20 @@ def test_the_box_problem_is_solved_exactly() -> None:
     d=st.floats(-20.0, 20.0),
     heading=st.floats(-1.5, 1.5),
     speed=st.floats(0.0, 60.0),
+    driven=st.none() | st.tuples(st.floats(-0.01, 0.01), st.floats(-8.0, 10.0)),
 )
 def test_bounds_hold_whatever_is_asked(
-    solvers: dict[str, Mpc], seed: int, cohesion: float, d: float, heading: float, speed: float
+    solvers: dict[str, Mpc],
+    seed: int,
+    cohesion: float,
+    d: float,
+    heading: float,
+    speed: float,
+    driven: tuple[float, float] | None,
 ) -> None:
     instance = problem(seed, cohesion=cohesion)
-    instance = replace(instance, ego=np.array([100.0, d, heading, speed]))
+    last = None if driven is None else Control(*driven)
+    instance = replace(instance, ego=np.array([100.0, d, heading, speed]), driven=last)
     mpc = solvers["ilqr"]
     mpc.reset()
     solution = mpc.solve(instance)
@@ -149,13 +164,74 @@ def test_bounds_hold_whatever_is_asked(
         assert "returned" in solution.status  # the planner then brakes in lane
         return
     assert np.isfinite(solution.states).all()
+    hold_limits(solution, instance)
+
+
+def hold_limits(solution: Solution, instance: Problem) -> None:
+    """Assert that every control of a solution keeps to every limit, the interior point's hair."""
+    speed = float(instance.ego[3])
     curvature, acceleration = solution.controls.T
     assert np.abs(curvature).max() <= SETTINGS.max_curvature + 1e-9
+    aside = np.abs(curvature) * solution.states[:-1, 3] ** 2
+    assert aside.max() <= SETTINGS.max_lateral_acceleration * (1.0 + 1e-6) + 1e-6
     drag = SETTINGS.friction * speed
     stops = acceleration * 0.1 <= -solution.states[:-1, 3] * (1.0 - SETTINGS.friction * 0.1) + 1e-6
     assert (acceleration >= drag - SETTINGS.max_braking - 1e-6)[~stops].all()
     assert acceleration.max() <= drag + SETTINGS.max_acceleration + 1e-6
     assert solution.states[:, 3].min() >= -1e-6  # what IPOPT, which rescues, calls zero
+    before = curvature[:1], acceleration[:1]
+    if instance.driven is not None:
+        low, high = control_bounds(SETTINGS, speed)
+        last = np.clip(np.array(instance.driven) / CONTROL_SCALE, low[0], high[0]) * CONTROL_SCALE
+        before = last[:1], last[1:]
+    turned = np.abs(np.diff(np.concatenate((before[0], curvature))))
+    assert turned.max() <= 0.1 * SETTINGS.max_curvature_rate + 1e-7
+    change = np.diff(np.concatenate((before[1], acceleration)))
+    assert change.min() >= -0.1 * SETTINGS.max_jerk - 1e-5
+    assert (change <= 0.1 * SETTINGS.max_jerk + 1e-5)[~stops].all()
+
+
+@pytest.mark.parametrize("name", ["ilqr", "fatrop", "ipopt"])
+def test_tight_rates_bind_and_hold(name: str) -> None:
+    tight = SETTINGS.model_copy(
+        update={"solver": name, "max_jerk": 10.0, "max_curvature_rate": 0.005}
+    )
+    mpc, bound = Mpc(tight, 3), 0
+    for seed in range(1, 21, 2):
+        mpc.reset()
+        instance = replace(problem(seed), driven=Control(0.0, 0.0))
+        solution = mpc.solve(instance)
+        assert solution.status == "solved"
+        both = np.vstack((np.zeros(2), solution.controls))
+        turned = np.abs(np.diff(both[:, 0])).max()
+        assert turned <= 0.0005 + 1e-8
+        stands = solution.states[:-1, 3] < 1.0
+        assert (np.abs(np.diff(both[:, 1]))[~stands] <= 1.0 + 1e-5).all()
+        bound += turned > 0.000499
+    assert bound >= 5
+
+
+@pytest.mark.parametrize("cohesion", [1.0, 1e3, 1e6])
+def test_no_cohesion_buys_leaving_the_road(cohesion: float) -> None:
+    mpc = Mpc(SETTINGS, 3)
+    instance = problem(3, cohesion=cohesion)
+    weight = np.zeros((5, 10))
+    weight[[0, 2, 4], 0] = 36.0 * cohesion  # turn left, hard
+    instance = replace(
+        instance,
+        ego=np.array([100.0, 4.0, 0.0, 25.0]),
+        cars=problem(3).cars * 0.0 + np.array([FAR_AWAY, 0, 1, 0, 5, 1.8])[:, None, None],
+        cohesion_weight=weight,
+        cohesion_target=np.ones((5, 10)),
+        place_weight=np.full(10, cohesion),
+        place_target=np.full(10, 8.0),
+        constraint_weight=np.array([20.0 * (1.0 + weight.sum() + 10.0 * cohesion * 3.5**2)]),
+        road_curvature=np.zeros(10),
+        driven=None,
+    )
+    solution = mpc.solve(instance)
+    assert solution.solved
+    assert (solution.states[:, 1] + 0.9).max() <= 5.25 + 0.05
 
 
 def test_a_car_that_has_to_stop_stops(solvers: dict[str, Mpc]) -> None:
