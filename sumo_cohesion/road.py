@@ -22,7 +22,7 @@ SPACING = 1.0
 class RoadAhead(NamedTuple):
     """The road at n places.
 
-    lanes, widths : (L, n) m; infinitely far and NaN where a lane does not exist.
+    lanes, widths : (L, n) m; where a lane does not exist it is infinitely far and 1 m wide.
     right, left : (n,) m, borders of the paved strip.
     speed_limit, curvature : (n,) m/s and 1/m.
     """
@@ -71,6 +71,7 @@ class Road:
     _segments: list[tuple[float, ...]] = field(init=False, repr=False, compare=False)
     _near: dict[tuple[int, int], int] = field(init=False, repr=False, compare=False)
     _centre_or_far: FloatArray = field(init=False, repr=False, compare=False)
+    _width_or_one: FloatArray = field(init=False, repr=False, compare=False)
     _lane_rows: list[list[float]] = field(init=False, repr=False, compare=False)
     _strips: FloatArray = field(init=False, repr=False, compare=False)
 
@@ -87,6 +88,8 @@ class Road:
         # No lane is infinitely far: NaN would win every argmin.
         centre = np.where(np.isnan(self.lane_centre), np.inf, self.lane_centre)
         object.__setattr__(self, "_centre_or_far", centre)
+        width = np.where(np.isnan(self.lane_width), 1.0, self.lane_width)
+        object.__setattr__(self, "_width_or_one", width)
         object.__setattr__(self, "_lane_rows", centre.tolist())
         object.__setattr__(self, "_strips", _strips(self.lane_centre, self.lane_width))
 
@@ -139,12 +142,10 @@ class Road:
     def ahead(self, s: FloatArray, d: ArrayLike) -> RoadAhead:
         """Look the road up at places s (m), (n,), on the strip that holds d (m), one or (n,)."""
         i = self.index(s)
-        lane = np.abs(self._centre_or_far[i] - np.asarray(d, float)[..., None]).argmin(axis=1)
+        centres, widths = self._centre_or_far[i], self._width_or_one[i]
+        lane = np.abs(centres - np.asarray(d, float)[..., None]).argmin(axis=1)
         right, left = self._strips[i, lane].T
-        widths = self.lane_width[i]
-        return RoadAhead(
-            self._centre_or_far[i].T, widths.T, right, left, self.speed_limit[i], self.curvature[i]
-        )
+        return RoadAhead(centres.T, widths.T, right, left, self.speed_limit[i], self.curvature[i])
 
     def project(self, x: float, y: float) -> tuple[float, float, float, float]:
         """Road coordinates of one Cartesian point.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -47,8 +48,12 @@ def step(
 
 def _cos(angle: Any) -> Any:
     """Cosine of a number, an array or a symbol, whatever CasADi makes of NumPy's functions."""
+    if isinstance(angle, float):
+        return math.cos(angle)
     return angle.cos() if hasattr(angle, "cos") else np.cos(angle)
 
 
 def _sin(angle: Any) -> Any:
+    if isinstance(angle, float):
+        return math.sin(angle)
     return angle.sin() if hasattr(angle, "sin") else np.sin(angle)

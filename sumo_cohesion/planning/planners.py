@@ -10,6 +10,7 @@ import importlib
 import sys
 from dataclasses import replace
 from functools import lru_cache
+from math import cos, sin
 from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Protocol, runtime_checkable
@@ -35,6 +36,9 @@ from sumo_cohesion.state import AgreementRow, Control, FloatArray, Observation, 
 
 if TYPE_CHECKING:
     from sumo_cohesion.planning.mpc import Mpc
+
+
+_NO_CAR = np.array((FAR_AWAY, 0.0, 1.0, 0.0, 1.0, 1.0))[:, None, None]
 
 
 @runtime_checkable
@@ -72,6 +76,7 @@ class CohesivePlanner:
         self._election = Election(cohesion)
         self._mpc: Mpc | None = None
         self._driven: Control | None = None
+        self._ahead = DT * np.arange(1, settings.horizon + 1)
         # Where the horizon is asked for the others' place: every third step is dense enough.
         self._place_steps = list(range(1, settings.horizon + 1, 3))
 
@@ -129,8 +134,6 @@ class CohesivePlanner:
         assert self._mpc is not None
         expected = self._mpc.expected_lateral
         ahead = self._road.ahead(s, ego.d if expected is None else expected)
-        lanes, widths = ahead.lanes[:, 1:], ahead.widths[:, 1:]
-        missing = np.isinf(lanes)
         weight = np.zeros((len(FEATURES), horizon))
         target = np.zeros((len(FEATURES), horizon))
         if groups:
@@ -146,12 +149,12 @@ class CohesivePlanner:
             ego=np.array(ego),
             ego_width=np.array([observation.ego_size[1]]),
             road_curvature=ahead.curvature[:-1],
-            lanes=np.where(missing, FAR_AWAY, lanes),
-            lane_widths=np.where(missing, 1.0, widths),
+            lanes=np.minimum(ahead.lanes[:, 1:], FAR_AWAY),
+            lane_widths=ahead.widths[:, 1:],
             right=ahead.right[1:],
             left=ahead.left[1:],
             speed_limit=ahead.speed_limit[1:],
-            cars=self._predict_cars(observation, FAR_AWAY),
+            cars=self._predict_cars(observation),
             theta=self._theta,
             cohesion_weight=weight,
             cohesion_target=target,
@@ -173,25 +176,26 @@ class CohesivePlanner:
         # Between a known place and an unknown one the known one counts, ever less.
         return weight, np.interp(stages, steps[known], np.array(place.mean)[known])
 
-    def _predict_cars(self, observation: Observation, far: float) -> FloatArray:
+    def _predict_cars(self, observation: Observation) -> FloatArray:
         """Predict the nearest cars at constant velocity: (6, N, T), see reward.StageInputs."""
         horizon, n = self.settings.horizon, self.settings.cars
-        cars = np.zeros((6, n, horizon))
-        cars[0], cars[2], cars[4:] = far, 1.0, 1.0
-        states = observation.states
-        offset = states[:, :2] - (observation.ego.s, observation.ego.d)
+        ego, m = observation.ego, min(len(observation.ids), n)
+        cars = np.empty((6, n, horizon))
+        cars[:, m:] = _NO_CAR
+        if not m:
+            return cars
+        offset = observation.states[:, :2] - (ego.s, ego.d)
         nearest = np.argsort((offset * offset).sum(axis=1), kind="stable")[:n]
-        s, d, heading, speed = states[nearest].T
-        m = nearest.size
-        ahead = DT * np.arange(1, horizon + 1)
-        stretch = 1.0 - observation.curvature[nearest] * d
-        cos, sin = np.cos(heading), np.sin(heading)
-        cars[0, :m] = s[:, None] + (speed * cos / stretch)[:, None] * ahead
-        cars[1, :m] = d[:, None] + (speed * sin)[:, None] * ahead
-        cars[2, :m] = cos[:, None]
-        cars[3, :m] = sin[:, None]
-        half_sizes = (observation.sizes[nearest] + observation.ego_size) / 2
-        cars[4:, :m] = half_sizes.T[:, :, None]
+        s, d, heading, speed = observation.states[nearest].T
+        length, width = observation.sizes[nearest].T
+        along, across = np.cos(heading), np.sin(heading)
+        pace = speed * along / (1.0 - observation.curvature[nearest] * d)
+        half_length = 0.5 * (length + observation.ego_size[0])
+        half_width = 0.5 * (width + observation.ego_size[1])
+        rows = np.array((s, d, along, across, half_length, half_width))
+        cars[:, :m] = rows[:, :, None]
+        cars[0, :m] += pace[:, None] * self._ahead
+        cars[1, :m] += (speed * across)[:, None] * self._ahead
         return cars
 
     def _to_plan(
@@ -236,14 +240,14 @@ def explain(
     s, d, heading, speed = observation.ego
     curvature = float(road.curvature_at(s))
     on = (
-        s + DT * speed * np.cos(heading) / (1.0 - curvature * d),
-        d + DT * speed * np.sin(heading),
+        s + DT * speed * cos(heading) / (1.0 - curvature * d),
+        d + DT * speed * sin(heading),
         heading,
         speed,
     )
     own = social_features(observation.ego, on, DT, curvature)
     rows = [
-        AgreementRow(g.group, name, g.n, m, v, w, float(o), float(beta * w * (m - o) ** 2))
+        AgreementRow(g.group, name, g.n, m, v, w, o, beta * w * (m - o) ** 2)
         for g in groups
         for name, m, v, w, o in zip(FEATURES, g.mean, g.variance, g.weight, own, strict=True)
     ]

@@ -51,8 +51,11 @@ def checked(plan: Plan, observation: Observation, road: Road, settings: PlannerS
     own = _extent(ego.heading, observation.ego_size)
     states, sizes = observation.states.tolist(), observation.sizes.tolist()
     stretches = (1.0 - observation.curvature * observation.states[:, 1]).tolist()
+    longest = 0.5 * sum(observation.ego_size)
     for name, state, size, stretch in zip(observation.ids, states, sizes, stretches, strict=True):
         s, d, heading, speed = state
+        if ego.s - s > longest + 0.5 * (size[0] + size[1]):
+            continue  # behind, however the two are turned
         other = _extent(heading, size)
         along, across = speed * cos(heading), speed * sin(heading)
         ahead = s + DT * along / stretch - after[0] - own[0] - other[0]

@@ -51,6 +51,20 @@ class Stage(NamedTuple):
         return -sum(self.terms.values())
 
 
+_PER_STAGE = (
+    "road_curvature",
+    "lanes",
+    "lane_widths",
+    "right",
+    "left",
+    "speed_limit",
+    "cohesion_weight",
+    "cohesion_target",
+    "place_weight",
+    "place_target",
+)
+
+
 class StageParameters:
     """Where each part of a Problem lies in a stage's parameter vector."""
 
@@ -73,6 +87,9 @@ class StageParameters:
             "constraint_weight": 1,
         }
         self.size = sum(self.sizes.values())
+        ends = np.cumsum(list(self.sizes.values())).tolist()
+        starts = [0, *ends[:-1]]
+        self._places = dict(zip(self.sizes, map(slice, starts, ends), strict=True))
 
     def symbols(self) -> dict[str, Any]:
         """Return one symbol per part."""
@@ -80,17 +97,13 @@ class StageParameters:
 
     def fill(self, problem: Problem, out: FloatArray) -> None:
         """Write a problem's parameters: ``out`` is (T, size), one row per stage."""
-        columns = out.T
-        columns[0] = problem.ego_width[0]
-        start = 1 + self.sizes["theta"]
-        columns[1:start] = problem.theta[:, None]
-        for name in list(self.sizes)[2:]:
-            end = start + self.sizes[name]
-            part = getattr(problem, name)
-            if name == "cars":
-                part = part.transpose(1, 0, 2).reshape(self.sizes[name], -1)
-            columns[start:end] = part
-            start = end
+        columns, places = out.T, self._places
+        for name in ("ego_width", "theta", "constraint_weight"):  # the same at all stages
+            columns[places[name]] = getattr(problem, name)[:, None]
+        for name in _PER_STAGE:
+            columns[places[name]] = getattr(problem, name)
+        cars = problem.cars.transpose(1, 0, 2)
+        columns[places["cars"]] = cars.reshape(self.sizes["cars"], -1)
 
 
 def make_stage(settings: PlannerSettings, parameters: StageParameters) -> Stage:
@@ -137,8 +150,7 @@ def make_stage(settings: PlannerSettings, parameters: StageParameters) -> Stage:
 def make_instance(problem: Problem, stages: FloatArray, settings: PlannerSettings) -> Instance:
     """Put a problem into the solvers' numbers; ``stages`` are its filled parameters."""
     low, high = control_bounds(settings, float(problem.ego[3]))
-    change = np.empty_like(low)
-    change[:] = (settings.max_curvature_rate, settings.max_jerk)
+    change = np.array([(settings.max_curvature_rate, settings.max_jerk)] * settings.horizon)
     change *= DT / CONTROL_SCALE
     start = np.zeros(N_STATES)
     start[:4] = problem.ego
@@ -158,14 +170,12 @@ def control_bounds(settings: PlannerSettings, speed: float) -> tuple[FloatArray,
     is bounded so that the lateral acceleration keeps to its bound however fast the ego may be by
     then.
     """
-    fastest = speed + DT * settings.max_acceleration * np.arange(settings.horizon)
-    drag = settings.friction * speed
-    low, high = np.empty((settings.horizon, 2)), np.empty((settings.horizon, 2))
-    high[:, 0] = settings.max_lateral_acceleration / np.maximum(fastest, 1e-3) ** 2
-    np.minimum(high[:, 0], settings.max_curvature, out=high[:, 0])
-    low[:, 0] = -high[:, 0]
-    low[:, 1], high[:, 1] = drag - settings.max_braking, drag + settings.max_acceleration
-    return low / CONTROL_SCALE, high / CONTROL_SCALE
+    # Numbers, not arrays: for so few it is faster.
+    fastest = [speed + DT * settings.max_acceleration * t for t in range(settings.horizon)]
+    bends = [settings.sharpest(v) / float(CONTROL_SCALE[0]) for v in fastest]
+    drag, unit = settings.friction * speed, float(CONTROL_SCALE[1])
+    least, most = (drag - settings.max_braking) / unit, (drag + settings.max_acceleration) / unit
+    return np.array([(-b, least) for b in bends]), np.array([(b, most) for b in bends])
 
 
 def standstill(state: Any, settings: PlannerSettings) -> Any:
