@@ -73,9 +73,8 @@ class Peer:
     def __init__(self, settings: PlannerSettings, n_lanes: int) -> None:
         self.settings = settings
         stage = make_stage(settings, StageParameters(settings, n_lanes))
-        inputs = [stage.state, stage.control, stage.parameters]
-        self.step = ca.Function("step", inputs, [stage.next_state])
-        self.cost = ca.Function("cost", inputs, [stage.cost])
+        self.step = ca.Function("step", stage.inputs(), [stage.next_state])
+        self.cost = ca.Function("cost", stage.inputs(), stage.landed(stage.cost))
         self.n_parameters = stage.parameters.shape[0]
 
 
@@ -235,8 +234,7 @@ class Judge:
     def __init__(self, settings: PlannerSettings, n_lanes: int) -> None:
         stage = make_stage(settings, StageParameters(settings, n_lanes))
         terms = ca.vertcat(*[stage.terms[name] for name in TERMS])
-        inputs = [stage.state, stage.control, stage.parameters]
-        self._one = ca.Function("one", inputs, [stage.next_state, ca.sum1(terms)])
+        self._one = ca.Function("one", stage.inputs(), [stage.next_state, *stage.landed(terms)])
 
     def reward(self, instance: Instance, controls: np.ndarray) -> float:
         x, total = instance.ego, 0.0
@@ -302,7 +300,7 @@ def floor(horizon: int) -> dict[str, float]:
     """Microseconds of one evaluation of the objective and of one derivative pass, compiled."""
     solver = mpc_module.Ilqr(PlannerSettings(horizon=horizon), 3)
     found = {}
-    for name, run in (("objective", solver._run_forward), ("derivatives", solver._run_backward)):
+    for name, run in (("objective", solver._run_forward), ("derivatives", solver._run_exact)):
         times = []
         for _ in range(2000):
             begin = time.perf_counter()

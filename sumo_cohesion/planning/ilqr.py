@@ -63,14 +63,14 @@ class Ilqr:
         stage = make_stage(settings, self._parameters)
         functions, self.how = compiled(
             [
-                _backward_pass(stage, settings),
+                _backward_pass(stage, settings, exact=True),
+                _backward_pass(stage, settings, exact=False),
                 _forward_pass(stage, settings),
             ]
         )
-        self._backward, self._forward = functions
-        self._allocate()
+        self._allocate(*functions)
 
-    def _allocate(self) -> None:
+    def _allocate(self, exact: Any, gauss_newton: Any, forward: Any) -> None:
         """Make the arrays that both functions read and write in place."""
         t, f = self._settings.horizon, np.zeros
         self._x, self._x_new = f((t + 1, N_STATES)), f((t + 1, N_STATES))
@@ -78,18 +78,17 @@ class Ilqr:
         self._p = f((t, self._parameters.size))
         self._low, self._high, self._most = f((t, 2)), f((t, 2)), f((t, 2))
         self._step, self._gain = f((t, 2)), f((t, N_STATES, 2))
-        self._exact, self._mu, self._length = f(1), f(1), f(1)
+        self._mu, self._length = f(1), f(1)
         self._change, self._convexity, self._terms = f(1), f(1), f(len(TERMS))
         bounds = [self._low, self._high, self._most]
         # A C-ordered (T, n) array is a CasADi matrix of T columns.
-        self._run_backward = BoundCall(
-            self._backward,
-            [self._x, self._u, self._p, *bounds, self._exact, self._mu],
-            [self._step, self._gain, self._change, self._convexity],
-        )
+        given = [self._x, self._u, self._p, *bounds]
+        found = [self._step, self._gain, self._change, self._convexity]
+        self._run_exact = BoundCall(exact, [*given, self._mu], found)
+        self._run_gauss_newton = BoundCall(gauss_newton, [*given, self._mu], found)
         self._run_forward = BoundCall(
-            self._forward,
-            [self._x, self._u, self._p, *bounds, self._step, self._gain, self._length],
+            forward,
+            [*given, self._step, self._gain, self._length],
             [self._x_new, self._u_new, self._terms],
         )
 
@@ -103,8 +102,8 @@ class Ilqr:
         self._accept()
         exact, mu = True, _REGULARISATION[0]
         for iteration in range(1, self._settings.max_iterations + 1):
-            self._exact[0], self._mu[0] = exact, mu
-            self._run_backward()
+            self._mu[0] = mu
+            (self._run_exact if exact else self._run_gauss_newton)()
             if exact and not self._convexity[0] > _LEAST_CURVATURE:
                 exact = False
                 continue
@@ -181,26 +180,26 @@ class Ilqr:
         )
 
 
-def _backward_pass(stage: Stage, settings: PlannerSettings) -> Any:
-    """(x, u, p, low, high, most, exact, mu) -> (steps, gains, change of cost, least curvature).
+def _backward_pass(stage: Stage, settings: PlannerSettings, *, exact: bool) -> Any:
+    """(x, u, p, low, high, most, mu) -> (steps, gains, change of cost, least curvature).
 
     ``most`` bounds how much a control may differ from the one before.
     """
-    one = _riccati_step(stage, settings)
-    t = settings.horizon
-    n = N_STATES
+    one = _riccati_step(stage, settings, exact=exact)
+    t, n = settings.horizon, N_STATES
     x, u, p, *bounds = _trajectory(stage, t)
-    exact, mu = ca.MX.sym("exact"), ca.MX.sym("mu")
+    mu = ca.MX.sym("mu")
     gradient, hessian, change = ca.MX.zeros(n), ca.MX.zeros(n, n), ca.MX(0)
     steps, gains, curvatures = [ca.MX()] * t, [ca.MX()] * t, []
     for i in reversed(range(t)):
         gradient, hessian, steps[i], gains[i], gain, curvature = one(
-            gradient, hessian, x[:, i], u[:, i], p[:, i], *[b[:, i] for b in bounds], exact, mu
+            gradient, hessian, x[:, i], u[:, i], p[:, i], *[b[:, i] for b in bounds], mu
         )
         change += gain
         curvatures.append(curvature)
     outputs = [ca.horzcat(*steps), ca.horzcat(*gains), change, ca.mmin(ca.vertcat(*curvatures))]
-    return ca.Function("backward", [x, u, p, *bounds, exact, mu], outputs)
+    name = "backward_exact" if exact else "backward_gauss_newton"
+    return ca.Function(name, [x, u, p, *bounds, mu], outputs)
 
 
 def _trajectory(stage: Stage, t: int) -> list[Any]:
@@ -211,20 +210,13 @@ def _trajectory(stage: Stage, t: int) -> list[Any]:
     return [ca.MX.sym(*shape) for shape in zip(names, sizes, columns, strict=True)]
 
 
-def _riccati_step(stage: Stage, settings: PlannerSettings) -> Any:
+def _riccati_step(stage: Stage, settings: PlannerSettings, *, exact: bool) -> Any:
     """One stage of the backward pass: the cost-to-go before it, from the one after it."""
     n = N_STATES
     gradient, hessian = ca.SX.sym("gradient", n), ca.SX.sym("hessian", n, n)
     low, high, most = (ca.SX.sym(name, 2) for name in ("low", "high", "most"))
-    exact, mu = ca.SX.sym("exact"), ca.SX.sym("mu")
-    z = ca.vertcat(stage.state, stage.control)
-    # Exact: the dynamics' own curvature, weighted by the cost-to-go, belongs to it (DDP).
-    newton, _ = ca.hessian(stage.cost + ca.dot(gradient, stage.next_state), z)
-    jacobian = ca.jacobian(stage.residuals, z)
-    gauss_newton = jacobian.T @ (ca.repmat(stage.residual_weights, 1, n + 2) * jacobian)
-    move = ca.jacobian(stage.next_state, z)
-    model = exact * newton + (1.0 - exact) * gauss_newton + move.T @ hessian @ move
-    slope = ca.gradient(stage.cost, z) + move.T @ gradient
+    mu = ca.SX.sym("mu")
+    slope, model = _quadratic(stage, gradient, hessian, exact=exact)
     xx, ux, uu = model[:n, :n], model[n:, :n], model[n:, n:]
     x_slope, u_slope = slope[:n], slope[n:]
 
@@ -241,8 +233,8 @@ def _riccati_step(stage: Stage, settings: PlannerSettings) -> Any:
     hessian_before = xx + gain.T @ uu @ gain + gain.T @ ux + ux.T @ gain
     change = ca.dot(step, u_slope) + 0.5 * ca.dot(step, uu @ step)
     return ca.Function(
-        "riccati",
-        [gradient, hessian, *_stage_inputs(stage), low, high, most, exact, mu],
+        "riccati_exact" if exact else "riccati_gauss_newton",
+        [gradient, hessian, *stage.inputs(), low, high, most, mu],
         [
             gradient_before,
             0.5 * (hessian_before + hessian_before.T),
@@ -255,8 +247,30 @@ def _riccati_step(stage: Stage, settings: PlannerSettings) -> Any:
     )
 
 
-def _stage_inputs(stage: Stage) -> list[Any]:
-    return [stage.state, stage.control, stage.parameters]
+def _quadratic(stage: Stage, gradient: Any, hessian: Any, *, exact: bool) -> tuple[Any, Any]:
+    """Gradient and Hessian, in (state, control), of a stage's cost and the cost-to-go after it.
+
+    The cost is a function of w = (landing, road state, control), of few of which most of it
+    depends; the chain rule does the rest. Exact: the dynamics' own curvature, weighted by all that
+    depends on where they lead, belongs to it (DDP).
+    """
+    z = ca.vertcat(stage.state, stage.control)
+    w = ca.vertcat(stage.landing, stage.state[:4], stage.control)
+    of_w = ca.jacobian(ca.vertcat(stage.next_state[:4], stage.state[:4], stage.control), z)
+    move = ca.jacobian(stage.next_state, z)
+    if exact:
+        curvature, by_w = ca.hessian(stage.cost, w)
+    else:
+        by_w, rows = ca.gradient(stage.cost, w), ca.jacobian(stage.residuals, w)
+        curvature = rows.T @ (ca.repmat(stage.residual_weights, 1, w.shape[0]) * rows)
+    by_w, curvature = stage.landed(by_w, curvature)
+    slope = of_w.T @ by_w + move.T @ gradient
+    model = of_w.T @ curvature @ of_w + move.T @ hessian @ move
+    if exact:
+        price = ca.SX.sym("price", 4)
+        bend, _ = ca.hessian(ca.dot(price, stage.next_state[:4]), z)
+        model += ca.substitute(bend, price, by_w[:4] + gradient[:4])
+    return slope, model
 
 
 def _box_step(h: Any, g: Any, low: Any, high: Any) -> tuple[Any, list[Any]]:

@@ -36,9 +36,8 @@ class InteriorPoint:
         layout = StageParameters(settings, n_lanes)
         horizon = settings.horizon
         stage = make_stage(settings, layout)
-        terms = ca.vertcat(*[stage.terms[term] for term in TERMS])
-        inputs = [stage.state, stage.control, stage.parameters]
-        one = ca.Function("stage", inputs, [stage.next_state, terms])
+        terms = stage.landed(ca.vertcat(*[stage.terms[term] for term in TERMS]))
+        one = ca.Function("stage", stage.inputs(), [stage.next_state, *terms])
         start, p = ca.SX.sym("start", N_STATES), ca.SX.sym("p", layout.size, horizon)
         change = ca.SX.sym("change", 2, horizon)
         states = [ca.SX.sym(f"x{t}", N_STATES) for t in range(horizon + 1)]

@@ -30,7 +30,9 @@ TERMS = (*RewardWeights.model_fields, "cohesion", "constraints")
 class Stage(NamedTuple):
     """Expressions of one stage in ``state`` (6), ``control`` (2, scaled) and ``parameters``.
 
-    The state is the road state and the scaled control of the stage before.
+    The state is the road state and the scaled control of the stage before. ``next_state`` is where
+    the control leads. The terms are written in a symbol ``landing`` (4) that stands for the road
+    state there: their derivatives are cheap in it, and dear in what leads there.
 
     ``residuals`` r and ``residual_weights`` w say the same cost as a weighted sum of squares, in
     the sense that its gradient is J'(w r) and J' diag(w) J is positive semidefinite: what a
@@ -41,6 +43,7 @@ class Stage(NamedTuple):
     control: Any
     parameters: Any
     next_state: Any
+    landing: Any
     terms: dict[str, Any]
     residuals: Any
     residual_weights: Any
@@ -49,6 +52,15 @@ class Stage(NamedTuple):
     def cost(self) -> Any:
         """Minus the sum of all terms."""
         return -sum(self.terms.values())
+
+    def landed(self, *expressions: Any) -> list[Any]:
+        """Put the road state where the control leads in the place of ``landing``."""
+        where = [self.next_state[:4]]
+        return list(ca.substitute(list(expressions), [self.landing], where))
+
+    def inputs(self) -> list[Any]:
+        """State, control and parameters, of which everything is a function."""
+        return [self.state, self.control, self.parameters]
 
 
 _PER_STAGE = (
@@ -112,7 +124,9 @@ def make_stage(settings: PlannerSettings, parameters: StageParameters) -> Stage:
     p = parameters.symbols()
     physical = [control[i] * float(CONTROL_SCALE[i]) for i in range(2)]
     before = ca.vertsplit(state)[:4]
-    after = dynamics.step(before, physical, DT, settings.friction, p["road_curvature"])
+    reached = dynamics.step(before, physical, DT, settings.friction, p["road_curvature"])
+    landing = ca.SX.sym("landing", 4)
+    after = ca.vertsplit(landing)
     inputs = reward.StageInputs(
         lanes=p["lanes"],
         lane_widths=p["lane_widths"],
@@ -140,7 +154,8 @@ def make_stage(settings: PlannerSettings, parameters: StageParameters) -> Stage:
         state,
         control,
         ca.vertcat(*p.values()),
-        ca.vertcat(*after, control),
+        ca.vertcat(*reached, control),
+        landing,
         terms,
         ca.vertcat(*residuals),
         ca.vertcat(*weights),
@@ -208,11 +223,11 @@ def limited_stage(stage: Stage, settings: PlannerSettings) -> Any:
     low, high, change = ca.SX.sym("low", 2), ca.SX.sym("high", 2), ca.SX.sym("change", 2)
     lowest, highest = control_limits(stage.state, low, high, change, settings)
     control = ca.fmin(ca.fmax(stage.control, lowest), highest)
-    terms = ca.vertcat(*[stage.terms[name] for name in TERMS])
+    (terms,) = stage.landed(ca.vertcat(*[stage.terms[name] for name in TERMS]))
     after = ca.substitute([stage.next_state, terms], [stage.control], [control])
     return ca.Function(
         "stage",
-        [stage.state, stage.control, stage.parameters, low, high, change],
+        [*stage.inputs(), low, high, change],
         [after[0], control, after[1]],
         {"cse": True},
     )

@@ -96,12 +96,13 @@ def test_squares_have_the_gradient_of_the_cost_and_are_never_negative() -> None:
     parameters = StageParameters(SETTINGS, 3)
     stage = make_stage(SETTINGS, parameters)
     z = ca.vertcat(stage.state, stage.control)
-    jacobian = ca.jacobian(stage.residuals, z)
-    weighted = stage.residual_weights * stage.residuals
+    cost, residuals = stage.landed(stage.cost, stage.residuals)
+    (weights,) = stage.landed(stage.residual_weights)
+    jacobian = ca.jacobian(residuals, z)
     function = ca.Function(
         "gradients",
         [z, stage.parameters],
-        [ca.gradient(stage.cost, z), jacobian.T @ weighted, stage.residual_weights],
+        [ca.gradient(cost, z), jacobian.T @ (weights * residuals), weights],
     )
     for seed in range(50):
         instance = problem(seed)
