@@ -72,6 +72,7 @@ class Road:
     _near: dict[tuple[int, int], int] = field(init=False, repr=False, compare=False)
     _centre_or_far: FloatArray = field(init=False, repr=False, compare=False)
     _width_or_one: FloatArray = field(init=False, repr=False, compare=False)
+    _bends: list[float] = field(init=False, repr=False, compare=False)
     _lane_rows: list[list[float]] = field(init=False, repr=False, compare=False)
     _strips: FloatArray = field(init=False, repr=False, compare=False)
 
@@ -90,6 +91,7 @@ class Road:
         object.__setattr__(self, "_centre_or_far", centre)
         width = np.where(np.isnan(self.lane_width), 1.0, self.lane_width)
         object.__setattr__(self, "_width_or_one", width)
+        object.__setattr__(self, "_bends", self.curvature.tolist())
         object.__setattr__(self, "_lane_rows", centre.tolist())
         object.__setattr__(self, "_strips", _strips(self.lane_centre, self.lane_width))
 
@@ -101,6 +103,10 @@ class Road:
     def curvature_at(self, s: ArrayLike) -> FloatArray:
         """Curvature (1/m) of the reference line at arc lengths s (m)."""
         return self.curvature[self.index(s)]
+
+    def bend_at(self, s: float) -> float:
+        """Return curvature_at of one place: scalar arithmetic, faster than arrays."""
+        return self._bends[min(max(round((s - self.s0) / SPACING), 0), self.x.size - 1)]
 
     def speed_limit_at(self, s: ArrayLike) -> FloatArray:
         """Speed limit (m/s) at arc lengths s (m)."""

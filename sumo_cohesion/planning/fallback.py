@@ -47,6 +47,6 @@ def keep_lane(observation: Observation, road: Road, settings: PlannerSettings) -
     reach = max(0.7 * ego.speed, 5.0)
     off = ego.d - centre if isfinite(centre) else 0.0  # there is no lane here
     bend = -2.0 * ego.heading / reach - off / reach**2
-    curvature = float(road.curvature_at(ego.s)) + bend
+    curvature = road.bend_at(ego.s) + bend
     sharpest = settings.sharpest(ego.speed)
     return min(max(curvature, -sharpest), sharpest)

@@ -136,7 +136,8 @@ class Ilqr:
     def _load(self, instance: Instance, guess: Guess) -> None:
         self._p[:], self._x[0] = instance.stages, instance.start
         self._low[:], self._high[:], self._most[:] = instance.low, instance.high, instance.change
-        np.clip(guess.controls / CONTROL_SCALE, self._low, self._high, out=self._u)
+        np.divide(guess.controls, CONTROL_SCALE, out=self._u)
+        np.minimum(np.maximum(self._u, self._low, out=self._u), self._high, out=self._u)
         self._step[:], self._gain[:] = 0.0, 0.0
 
     def _search(self, cost: float, promised: float) -> float | None:

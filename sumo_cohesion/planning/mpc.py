@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache, partial
+from math import isfinite
 from typing import Protocol
 
 import numpy as np
@@ -80,7 +81,7 @@ class Mpc:
     def solve(self, problem: Problem) -> Solution:
         """Solve one instance; never raises for a solver's failure, see ``solved``."""
         self._parameters.fill(problem, self._stages)
-        if not np.isfinite(self._stages.sum() + problem.ego.sum()):
+        if not isfinite(self._stages.sum() + problem.ego.sum()):
             # Some solvers never return from a problem that is not a number.
             empty = np.zeros((0, 0))
             return Solution(empty, empty, False, "input is not finite", 0, 0.0, {})

@@ -103,12 +103,12 @@ class CohesivePlanner:
         assert self._mpc is not None, "call reset(road) before plan()"
         solution = self._mpc.solve(self._problem(observation, groups, place))
         # 4. Never without a plan: a failed solve brakes in lane.
-        plan = self._to_plan(observation, solution, groups, place)
+        plan = self._to_plan(observation, solution, groups, place, social_time)
         # 5. Never a plan without a way out: visible cars come before whatever was agreed.
         if self.settings.last_resort:
             plan = checked(plan, observation, self._road, self.settings)
         self._driven = plan.controls[0]
-        return replace(plan, social_time=social_time, solver=self._mpc.how)
+        return plan
 
     def _agreement(
         self, observation: Observation, history: History
@@ -204,10 +204,12 @@ class CohesivePlanner:
         solution: Solution,
         groups: tuple[Agreement, ...],
         place: Place,
+        social_time: float,
     ) -> Plan:
+        assert self._mpc is not None
         rows = explain(observation, groups, place, self.cohesion.beta, self._road)
         if not solution.solved:
-            return fallback(
+            plan = fallback(
                 observation,
                 self._road,
                 self.settings,
@@ -216,12 +218,15 @@ class CohesivePlanner:
                 solution.wall_time,
                 rows,
             )
+            return replace(plan, social_time=social_time, solver=self._mpc.how)
         return Plan(
             controls=tuple(Control(c, a) for c, a in solution.controls.tolist()),
             states=solution.states,
             status=solution.status,
+            solver=self._mpc.how,
             iterations=solution.iterations,
             wall_time=solution.wall_time,
+            social_time=social_time,
             reward=solution.reward,
             agreement=rows,
         )
@@ -238,7 +243,7 @@ def explain(
     if not groups:
         return ()
     s, d, heading, speed = observation.ego
-    curvature = float(road.curvature_at(s))
+    curvature = road.bend_at(s)
     on = (
         s + DT * speed * cos(heading) / (1.0 - curvature * d),
         d + DT * speed * sin(heading),

@@ -39,7 +39,7 @@ def checked(plan: Plan, observation: Observation, road: Road, settings: PlannerS
     if not plan.controls:
         return plan
     control, ego = plan.controls[0], observation.ego
-    bend = float(road.curvature_at(ego.s))
+    bend = road.bend_at(ego.s)
     after = dynamics.step(ego, control, DT, settings.friction, bend)
     # The curvature with which the ego goes parallel to the road after one step.
     level = bend * cos(ego.heading) / (1.0 - bend * ego.d)

@@ -18,8 +18,9 @@ from sumo_cohesion.planning.settings import PlannerSettings, RewardWeights
 from sumo_cohesion.social.features import FEATURES, social_features
 from sumo_cohesion.state import FloatArray
 
-CONTROL_SCALE = np.array([0.01, 5.0])
+SCALES = (0.01, 5.0)
 """Curvature (1/m) and acceleration (m/s²) that solvers see as one."""
+CONTROL_SCALE = np.array(SCALES)
 N_STATES = 6
 UNLIMITED = 1e6
 """Change of a scaled control that no bound stands against."""
@@ -122,7 +123,7 @@ def make_stage(settings: PlannerSettings, parameters: StageParameters) -> Stage:
     """Write down one stage."""
     state, control = ca.SX.sym("state", N_STATES), ca.SX.sym("control", 2)
     p = parameters.symbols()
-    physical = [control[i] * float(CONTROL_SCALE[i]) for i in range(2)]
+    physical = [control[i] * SCALES[i] for i in range(2)]
     before = ca.vertsplit(state)[:4]
     reached = dynamics.step(before, physical, DT, settings.friction, p["road_curvature"])
     landing = ca.SX.sym("landing", 4)
@@ -165,15 +166,16 @@ def make_stage(settings: PlannerSettings, parameters: StageParameters) -> Stage:
 def make_instance(problem: Problem, stages: FloatArray, settings: PlannerSettings) -> Instance:
     """Put a problem into the solvers' numbers; ``stages`` are its filled parameters."""
     low, high = control_bounds(settings, float(problem.ego[3]))
-    change = np.array([(settings.max_curvature_rate, settings.max_jerk)] * settings.horizon)
-    change *= DT / CONTROL_SCALE
+    change = np.empty((settings.horizon, 2))
+    change[:, 0] = DT * settings.max_curvature_rate / SCALES[0]
+    change[:, 1] = DT * settings.max_jerk / SCALES[1]
     start = np.zeros(N_STATES)
     start[:4] = problem.ego
     if problem.driven is None:
         change[0] = UNLIMITED
     else:
         # What was driven under other bounds, at another speed, must not leave nothing to choose.
-        driven = np.array(problem.driven) / CONTROL_SCALE
+        driven = [value / scale for value, scale in zip(problem.driven, SCALES, strict=True)]
         start[4:] = np.minimum(np.maximum(driven, low[0]), high[0])
     return Instance(start, stages, low, high, change)
 
@@ -185,17 +187,20 @@ def control_bounds(settings: PlannerSettings, speed: float) -> tuple[FloatArray,
     is bounded so that the lateral acceleration keeps to its bound however fast the ego may be by
     then.
     """
-    # Numbers, not arrays: for so few it is faster.
-    fastest = [speed + DT * settings.max_acceleration * t for t in range(settings.horizon)]
-    bends = [settings.sharpest(v) / float(CONTROL_SCALE[0]) for v in fastest]
-    drag, unit = settings.friction * speed, float(CONTROL_SCALE[1])
-    least, most = (drag - settings.max_braking) / unit, (drag + settings.max_acceleration) / unit
-    return np.array([(-b, least) for b in bends]), np.array([(b, most) for b in bends])
+    gain = DT * settings.max_acceleration
+    bends = [settings.sharpest(speed + gain * t) / SCALES[0] for t in range(settings.horizon)]
+    drag = settings.friction * speed
+    low, high = np.empty((settings.horizon, 2)), np.empty((settings.horizon, 2))
+    high[:, 0] = bends
+    low[:, 0] = -high[:, 0]
+    low[:, 1] = (drag - settings.max_braking) / SCALES[1]
+    high[:, 1] = (drag + settings.max_acceleration) / SCALES[1]
+    return low, high
 
 
 def standstill(state: Any, settings: PlannerSettings) -> Any:
     """Scaled acceleration that ends a stage at standstill: no car reverses."""
-    return (settings.friction - 1.0 / DT) * state[3] / float(CONTROL_SCALE[1])
+    return (settings.friction - 1.0 / DT) * state[3] / SCALES[1]
 
 
 def control_limits(

@@ -58,8 +58,10 @@ def group_votes(ego: RoadState, history: History, road: Road, settings: Cohesion
 
 def _vote_at_place(track: Track, ego: RoadState, settings: CohesionSettings) -> Vote | None:
     """Mean features of one car's transitions around the ego's place; None if it kept aside."""
-    across, d, width = track.middle_d, ego.d, settings.position_width
     passed = track.passed(ego.s, settings.position_length)
+    if not passed:
+        return None
+    across, d, width = track.middle_d, ego.d, settings.position_width
     here = [i for i in passed if abs(across[i] - d) <= width]
     if not here:
         return None
