@@ -9,6 +9,7 @@ centre in both.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from math import isfinite
 from typing import NamedTuple
 
 import numpy as np
@@ -110,6 +111,8 @@ class Observation:
 
     def __post_init__(self) -> None:
         _require_finite("Observation.states", self.states, (len(self.ids), 4))
+        if not isfinite(sum(self.ego)):
+            raise ValueError("Observation.ego holds a number that is not finite")
 
 
 class AgreementRow(NamedTuple):
@@ -131,6 +134,10 @@ class AgreementRow(NamedTuple):
     pull: float
 
 
+RESCUED = "rescued by ipopt"
+"""Start of a plan's status if the chosen solver failed and IPOPT, asked next, did not."""
+
+
 @dataclass(frozen=True, slots=True)
 class Plan:
     """What a planner decided, and why.
@@ -139,7 +146,7 @@ class Plan:
     ----------
     controls : the T planned controls; the first is driven. Empty: SUMO drives the ego.
     states : (T + 1, 4) predicted road states, the present one first.
-    status : "solved", "rescued by ipopt", "sumo", or why the plan is a fallback.
+    status : "solved", RESCUED, "sumo", or why the plan is a fallback.
     solver : which one, and whether it is compiled; empty for planners without.
     fallback : True if the solver gave nothing usable and the ego brakes in its lane.
     intervened : True if the last resort (planning.safety) changed the first control.

@@ -15,7 +15,8 @@ from sumo_cohesion.traffic.network import Network
 
 # A busy machine is no failure.
 settings.register_profile("any_machine", deadline=None)
-settings.load_profile("any_machine")
+settings.register_profile("thorough", deadline=None, max_examples=2500)
+settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "any_machine"))
 
 ROOT = Path(__file__).resolve().parent.parent
 NETWORKS = ROOT / "tests" / "networks"

@@ -151,6 +151,7 @@ METRICS = (
     Column("human_mean_speed", "float64", "m/s", "mean over humans that ever moved"),
     Column("human_hard_brakes", "int64", "", "times a human began to brake harder than 4.5 m/s²"),
     Column("plan_failures", "int64", "", "steps driven by the fallback"),
+    Column("plan_rescues", "int64", "", "steps in which the solver failed and IPOPT did not"),
     Column("interventions", "int64", "", "steps in which the last resort changed the control"),
     Column("plan_ms_median", "float64", "ms", "planner's call, median"),
     Column("plan_ms_p99", "float64", "ms", "planner's call, 99th percentile"),

@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 
 from sumo_cohesion.experiments.columns import as_table
-from sumo_cohesion.state import FloatArray
+from sumo_cohesion.state import RESCUED, FloatArray
 
 HARD_BRAKE = 4.5
 """m/s², SUMO's default comfortable deceleration: braking harder is not normal driving."""
@@ -66,6 +66,7 @@ def run_metrics(
         "max_lateral_acceleration": max_lateral_acceleration(ego),
         **human_metrics(humans),
         "plan_failures": int(plan["fallback"].sum()),
+        "plan_rescues": int(plan["status"].str.startswith(RESCUED).sum()),
         "interventions": int(plan["intervened"].sum()),
         "plan_ms_median": float(timing["plan_ms"].median()),
         "plan_ms_p99": float(timing["plan_ms"].quantile(0.99)),

@@ -9,35 +9,19 @@ import numpy as np
 from sumo_cohesion.planning.dynamics import DT
 from sumo_cohesion.planning.settings import PlannerSettings
 from sumo_cohesion.road import Road
-from sumo_cohesion.state import AgreementRow, Control, Observation, Plan
+from sumo_cohesion.state import Control, Observation, Plan
 
 BRAKING = 4.0
 """m/s², braking of the fallback plan."""
 
 
-def fallback(
-    observation: Observation,
-    road: Road,
-    settings: PlannerSettings,
-    status: str,
-    iterations: int = 0,
-    wall_time: float = 0.0,
-    agreement_rows: tuple[AgreementRow, ...] = (),
-) -> Plan:
+def fallback(observation: Observation, road: Road, settings: PlannerSettings, status: str) -> Plan:
     """Plan without a solver: brake in the lane the ego is in."""
     ego = observation.ego
     curvature = keep_lane(observation, road, settings)
     braking = min(BRAKING, ego.speed / DT)
     control = Control(curvature, settings.friction * ego.speed - braking)
-    return Plan(
-        controls=(control,),
-        states=np.array([ego]),
-        status=status,
-        fallback=True,
-        iterations=iterations,
-        wall_time=wall_time,
-        agreement=agreement_rows,
-    )
+    return Plan(controls=(control,), states=np.array([ego]), status=status, fallback=True)
 
 
 def keep_lane(observation: Observation, road: Road, settings: PlannerSettings) -> float:

@@ -20,8 +20,8 @@ from sumo_cohesion.planning.lbfgs import Lbfgs
 from sumo_cohesion.planning.nlp import InteriorPoint
 from sumo_cohesion.planning.problem import Guess, Instance, Problem, Solution
 from sumo_cohesion.planning.settings import PlannerSettings
-from sumo_cohesion.planning.stage import StageParameters, make_instance
-from sumo_cohesion.state import FloatArray
+from sumo_cohesion.planning.stage import CONTROL_SCALE, StageParameters, make_instance
+from sumo_cohesion.state import RESCUED, FloatArray
 
 
 class Solver(Protocol):
@@ -42,6 +42,10 @@ SOLVERS: dict[str, Callable[[PlannerSettings, int], Solver]] = {
 }
 
 
+_HAIR = 1e-3
+"""How far a solution may be from what it should be, in scaled controls and in SI units."""
+
+
 @lru_cache(maxsize=32)
 def shared_solver(name: str, settings: PlannerSettings, n_lanes: int) -> Solver:
     """Return a solver, built once per process: it remembers nothing between two solves."""
@@ -53,7 +57,8 @@ class Mpc:
 
     The first solve starts from a rollout that holds speed and lane; later ones from the last
     solution shifted by one step, unless ``reset`` is called. What the chosen solver cannot solve is
-    tried once more with IPOPT.
+    tried once more with IPOPT. No solver is believed: one that raises, or returns what cannot be a
+    solution, has failed.
     """
 
     def __init__(self, settings: PlannerSettings, n_lanes: int) -> None:
@@ -63,6 +68,7 @@ class Mpc:
         self._parameters = StageParameters(settings, n_lanes)
         self._stages = np.zeros((settings.horizon, self._parameters.size))
         self._warm: Guess | None = None
+        self._rest: Guess | None = None
 
     @property
     def how(self) -> str:
@@ -74,30 +80,79 @@ class Mpc:
         """Where across the road (m) the last solution is from now on, (T + 1,)."""
         return None if self._warm is None else self._warm.states[:, 1]
 
+    @property
+    def rest(self) -> Guess | None:
+        """What is left of the last solution after a failure, while that is more than half of it."""
+        return self._rest
+
     def reset(self) -> None:
         """Forget the last solution."""
-        self._warm = None
+        self._warm = self._rest = None
 
     def solve(self, problem: Problem) -> Solution:
         """Solve one instance; never raises for a solver's failure, see ``solved``."""
+        self._keep_rest()
         self._parameters.fill(problem, self._stages)
         if not isfinite(self._stages.sum() + problem.ego.sum()):
             # Some solvers never return from a problem that is not a number.
-            empty = np.zeros((0, 0))
-            return Solution(empty, empty, False, "input is not finite", 0, 0.0, {})
+            return _failed("input is not finite")
         instance = make_instance(problem, self._stages, self.settings)
-        solution = self.solver.solve(instance, self._warm or self._hold(problem))
+        guess = self._warm or self._hold(problem)
+        solution = self._attempt(self.solver, problem, instance, guess)
         if not solution.solved:
-            solution = self._rescued(instance, self._hold(problem), solution)
-        self._warm = self._shifted(solution) if solution.solved else None
+            solution = self._rescued(problem, instance, self._hold(problem), solution)
+        if solution.solved:
+            self._rest = Guess(solution.states, solution.controls)
+            self._warm = self._shifted(solution)
+        else:
+            self._warm = None
         return solution
 
-    def _rescued(self, instance: Instance, guess: Guess, failed: Solution) -> Solution:
+    def _keep_rest(self) -> None:
+        """Drop from the last solution the step that has been driven since."""
+        rest = self._rest
+        enough = rest is not None and 2 * (len(rest.controls) - 1) > self.settings.horizon
+        self._rest = Guess(rest.states[1:], rest.controls[1:]) if rest and enough else None
+
+    def _attempt(
+        self, solver: Solver, problem: Problem, instance: Instance, guess: Guess
+    ) -> Solution:
+        """Let a solver try; whatever goes wrong in it is a solution that is not ``solved``."""
+        try:
+            solution = solver.solve(instance, guess)
+        except MemoryError:
+            raise  # nothing else would work either
+        except Exception as error:
+            return _failed(f"{solver.name} raised {type(error).__name__}: {error}")
+        if solution.solved and not self._is_solution(solution, problem, instance):
+            return _failed(f"{solver.name} returned garbage", solution)
+        return solution
+
+    def _is_solution(self, solution: Solution, problem: Problem, instance: Instance) -> bool:
+        """Tell if all is finite and within bounds, and the first control leads where it says."""
+        states, controls = solution.states, solution.controls
+        horizon, friction = self.settings.horizon, self.settings.friction
+        if states.shape != (horizon + 1, 4) or controls.shape != (horizon, 2):
+            return False
+        if not isfinite(states.sum() + controls.sum()):
+            return False
+        scaled = controls / CONTROL_SCALE
+        if (scaled < instance.low - _HAIR).any() or (scaled > instance.high + _HAIR).any():
+            return False
+        start, bend = problem.ego.tolist(), float(problem.road_curvature[0])
+        reached = dynamics.step(start, controls[0].tolist(), DT, friction, bend)
+        claimed = states[:2].ravel().tolist()
+        return all(abs(a - b) < _HAIR for a, b in zip((*start, *reached), claimed, strict=True))
+
+    def _rescued(
+        self, problem: Problem, instance: Instance, guess: Guess, failed: Solution
+    ) -> Solution:
         """Try IPOPT, slower and sturdier."""
-        second = shared_solver("ipopt", self.settings, self.n_lanes).solve(instance, guess)
+        ipopt = shared_solver("ipopt", self.settings, self.n_lanes)
+        second = self._attempt(ipopt, problem, instance, guess)
         return replace(
             second,
-            status="rescued by ipopt" if second.solved else f"{failed.status}; {second.status}",
+            status=RESCUED if second.solved else f"{failed.status}; {second.status}",
             iterations=failed.iterations + second.iterations,
             wall_time=failed.wall_time + second.wall_time,
         )
@@ -123,3 +178,10 @@ class Mpc:
             np.concatenate((states[1:], np.array(last)[None])),
             np.concatenate((controls[1:], controls[-1:])),
         )
+
+
+def _failed(status: str, what: Solution | None = None) -> Solution:
+    """Make the solution that is none; ``what`` was offered as one."""
+    empty = np.zeros((0, 0))
+    iterations, wall_time = (what.iterations, what.wall_time) if what else (0, 0.0)
+    return Solution(empty, empty, False, status, iterations, wall_time, {})

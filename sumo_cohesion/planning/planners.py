@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import importlib
 import sys
-from dataclasses import replace
 from functools import lru_cache
 from math import cos, sin
 from pathlib import Path
@@ -102,7 +101,7 @@ class CohesivePlanner:
         # 3. How: trade the ego's reward against cohesion (eq. 2) by MPC (section II-A).
         assert self._mpc is not None, "call reset(road) before plan()"
         solution = self._mpc.solve(self._problem(observation, groups, place))
-        # 4. Never without a plan: a failed solve brakes in lane.
+        # 4. Never without a plan: after a failed solve the last plan goes on, or the ego brakes.
         plan = self._to_plan(observation, solution, groups, place, social_time)
         # 5. Never a plan without a way out: visible cars come before whatever was agreed.
         if self.settings.last_resort:
@@ -208,21 +207,19 @@ class CohesivePlanner:
     ) -> Plan:
         assert self._mpc is not None
         rows = explain(observation, groups, place, self.cohesion.beta, self._road)
-        if not solution.solved:
-            plan = fallback(
-                observation,
-                self._road,
-                self.settings,
-                solution.status,
-                solution.iterations,
-                solution.wall_time,
-                rows,
-            )
-            return replace(plan, social_time=social_time, solver=self._mpc.how)
+        rest = self._mpc.rest
+        if not solution.solved and rest is None:
+            braking = fallback(observation, self._road, self.settings, solution.status)
+            controls, states = braking.controls, braking.states
+        elif not solution.solved and rest is not None:
+            controls, states = _controls(rest.controls), rest.states
+        else:
+            controls, states = _controls(solution.controls), solution.states
         return Plan(
-            controls=tuple(Control(c, a) for c, a in solution.controls.tolist()),
-            states=solution.states,
+            controls=controls,
+            states=states,
             status=solution.status,
+            fallback=not solution.solved,
             solver=self._mpc.how,
             iterations=solution.iterations,
             wall_time=solution.wall_time,
@@ -230,6 +227,10 @@ class CohesivePlanner:
             reward=solution.reward,
             agreement=rows,
         )
+
+
+def _controls(rows: FloatArray) -> tuple[Control, ...]:
+    return tuple([Control(c, a) for c, a in rows.tolist()])
 
 
 def explain(

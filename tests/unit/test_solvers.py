@@ -137,7 +137,7 @@ def test_the_box_problem_is_solved_exactly() -> None:
         assert value(step) <= min(value(np.array(u)) for u in product(*sides)) + 1e-12
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=settings().max_examples * 4)
 @given(
     seed=st.integers(0, 10**6),
     cohesion=st.sampled_from([0.0, 1.0, 1e3, 1e6]),
