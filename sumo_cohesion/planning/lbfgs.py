@@ -1,4 +1,8 @@
-"""Reference: the paper's own method, L-BFGS on the controls alone (section IV), by SciPy."""
+"""Reference: the paper's own method, L-BFGS on the controls alone (section IV), by SciPy.
+
+It takes bounds and no constraints: of the controls' rates it keeps that of the first one, the only
+one that is driven.
+"""
 
 from __future__ import annotations
 
@@ -15,6 +19,7 @@ from sumo_cohesion.planning.stage import (
     CONTROL_SCALE,
     N_STATES,
     TERMS,
+    UNLIMITED,
     StageParameters,
     limited_stage,
     make_stage,
@@ -33,41 +38,43 @@ class Lbfgs:
         one = limited_stage(make_stage(settings, parameters), settings)
         t = settings.horizon
         start, u = ca.MX.sym("start", N_STATES), ca.MX.sym("u", 2, t)
-        p, most = ca.MX.sym("p", parameters.size, t), ca.MX.sym("most", 2, t)
+        p = ca.MX.sym("p", parameters.size, t)
         state, total, states, driven = start, ca.MX.zeros(len(TERMS)), [start], []
         for i in range(t):
-            state, control, gained = one(state, u[:, i], p[:, i], -ca.inf, ca.inf, most[:, i])
+            state, control, gained = one(state, u[:, i], p[:, i], -ca.inf, ca.inf, UNLIMITED)
             states.append(state)
             driven.append(control)
             total += gained
         cost = -ca.sum1(total)
         function = ca.Function(
             "cost",
-            [start, u, p, most],
+            [start, u, p],
             [cost, ca.gradient(cost, u), ca.horzcat(*states), ca.horzcat(*driven), total],
         )
         (function,), self.how = compiled([function])
         self._start, self._p = np.zeros(N_STATES), np.zeros((t, p.shape[0]))
-        self._u, self._most = np.zeros((t, 2)), np.zeros((t, 2))
+        self._u = np.zeros((t, 2))
         self._cost, self._gradient = np.zeros(1), np.zeros((t, 2))
         self._states, self._driven = np.zeros((t + 1, N_STATES)), np.zeros((t, 2))
         self._terms = np.zeros(len(TERMS))
         outputs = [self._cost, self._gradient, self._states, self._driven, self._terms]
-        self._run = BoundCall(function, [self._start, self._u, self._p, self._most], outputs)
+        self._run = BoundCall(function, [self._start, self._u, self._p], outputs)
 
     def solve(self, instance: Instance, guess: Guess) -> Solution:
         """Solve from a guess of the controls; the guess of the states is not needed."""
         start = time.perf_counter()
         self._p[:], self._start[:] = instance.stages, instance.start
-        self._most[:] = instance.change
-        low, high = instance.low.ravel().tolist(), instance.high.ravel().tolist()
-        first = np.clip(guess.controls / CONTROL_SCALE, instance.low, instance.high)
+        low, high = instance.low.copy(), instance.high.copy()
+        last, most = instance.start[4:], instance.change[0]
+        low[0] = np.minimum(np.maximum(low[0], last - most), high[0])
+        high[0] = np.maximum(np.minimum(high[0], last + most), low[0])
+        first = np.clip(guess.controls / CONTROL_SCALE, low, high)
         result = minimize(
             self._cost_and_gradient,
             first.ravel(),
             method="L-BFGS-B",
             jac=True,
-            bounds=list(zip(low, high, strict=True)),
+            bounds=list(zip(low.ravel().tolist(), high.ravel().tolist(), strict=True)),
             options={"maxiter": 10 * self._settings.max_iterations},
         )
         self._cost_and_gradient(result.x)

@@ -20,7 +20,7 @@ from sumo_cohesion.planning.stage import (
     TERMS,
     StageParameters,
     make_stage,
-    standstill,
+    rate_excess,
 )
 from sumo_cohesion.state import FloatArray
 
@@ -52,12 +52,7 @@ class InteriorPoint:
             if t == 0:
                 constraints.append(states[0] - start)
                 equality += [True] * N_STATES
-            # Not positive: how much more than it may a control differs from the one before.
-            last, most = states[t][4:], change[:, t]
-            highest = ca.vertcat(
-                last[0] + most[0], ca.fmax(last[1] + most[1], standstill(states[t], settings))
-            )
-            constraints += [last - most - controls[t], controls[t] - highest]
+            constraints.append(rate_excess(states[t], controls[t], change[:, t], settings))
             equality += [False] * 4
             total += gained
         unknowns.append(states[horizon])

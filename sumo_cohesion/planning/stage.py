@@ -220,6 +220,16 @@ def control_limits(
     )
 
 
+def rate_excess(state: Any, control: Any, change: Any, settings: PlannerSettings) -> Any:
+    """How much more than it may a control differs from the one before; (4,), none positive.
+
+    The same limits as control_limits, for solvers that take them as constraints.
+    """
+    last, stop = state[4:], standstill(state, settings)
+    highest = ca.vertcat(last[0] + change[0], ca.fmax(last[1] + change[1], stop))
+    return ca.vertcat(last - change - control, control - highest)
+
+
 def limited_stage(stage: Stage, settings: PlannerSettings) -> Any:
     """(state, control, parameters, low, high, change) -> (next state, control as driven, terms).
 
