@@ -17,6 +17,7 @@ def car(name: str, s: np.ndarray, d: float = 0.0, dt: float = 0.1) -> pd.DataFra
         {
             "time": np.round(dt * np.arange(n), 6),
             "vehicle": name,
+            "planned": False,
             "s": s,
             "d": np.full(n, d),
             "speed": speed,
