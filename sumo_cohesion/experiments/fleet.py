@@ -20,7 +20,7 @@ from sumo_cohesion.perception.history import History
 from sumo_cohesion.perception.observation import Overview
 from sumo_cohesion.planning.planners import Planner, make_planner
 from sumo_cohesion.road import Road
-from sumo_cohesion.social.memory import new_history
+from sumo_cohesion.social.memory import SharedFeatures, new_history
 from sumo_cohesion.state import CartesianState, FloatArray, Scene
 from sumo_cohesion.traffic.contact import contacts
 from sumo_cohesion.traffic.demand import EGO
@@ -70,15 +70,16 @@ class Fleet:
 
     A car is taken in when it is equipped and comes into the ego's sensing range. It is handed
     back, by no longer being driven, when it is `HYSTERESIS` beyond that range, at the end of its
-    route, or when it has touched another car; the last two are never taken in again. So are cars
-    that no road can be built for, and for as long as they have a stop to make, those with a
-    stop in their route: planners know nothing of stops.
+    route, or when it has touched another car; the last two are never taken in again. Never taken
+    in are cars that no road can be built for, and none as long as it has a stop to make: planners
+    know nothing of stops.
     """
 
     def __init__(self, setup: Setup) -> None:
         self._setup = setup
         self._sensing = setup.scenario.sensing
         self._members: dict[str, _Member] = {}
+        self._features = SharedFeatures()
         self._human: set[str] = set(setup.not_human)  # never taken in (again)
         self._were_planned: set[str] = set()
         self._touched: dict[str, list[str]] = {}
@@ -91,8 +92,9 @@ class Fleet:
         """Cars that egos do not follow: those that planners drive or drove before.
 
         What a car did while it was planned stays remembered, so it is no human's vote later on.
+        If egos follow egos, only wrecks are left.
         """
-        return () if self._setup.cohesion.follow_egos else self._were_planned
+        return self._touched if self._setup.cohesion.follow_egos else self._were_planned
 
     def meet(self, scene: Scene, register: Register) -> None:
         """Hand back who is no longer to be planned, and take in who is now; once per scene."""
@@ -121,6 +123,7 @@ class Fleet:
         if not self._members:
             return {}
         setup = self._setup
+        self._features.next_step()
         shown = [i for i, name in enumerate(scene.ids) if name not in self._sensing.hidden]
         ids = (*[scene.ids[i] for i in shown], EGO)
         states = np.concatenate((scene.states[shown], [scene.ego]))
@@ -192,7 +195,8 @@ class Fleet:
             return
         planner = make_planner(setup.planner_name, setup.settings, setup.cohesion)
         planner.reset(road)
-        self._members[name] = _Member(road, planner, new_history(setup.cohesion, STEP_LENGTH))
+        history = new_history(setup.cohesion, STEP_LENGTH, self._features)
+        self._members[name] = _Member(road, planner, history)
         self._were_planned.add(name)
 
     def _stays_human(self, name: str) -> None:
