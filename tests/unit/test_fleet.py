@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sumo_cohesion.experiments.fleet import _near_another, is_equipped
+from sumo_cohesion.experiments.fleet import Fleet, _near_another, is_equipped
+from sumo_cohesion.experiments.setup import prepare
 from sumo_cohesion.perception.observation import Overview, Sensor
 from sumo_cohesion.road import Road
 from sumo_cohesion.social.features import social_features
@@ -98,3 +101,30 @@ def test_shared_features_are_the_features() -> None:
     assert shared(before, after, 0.5, 0.0) is shared(before, after, 0.5, 0.0)
     shared.next_step()
     assert shared(before, after, 0.5, 0.0) == social_features(before, after, 0.5, 0.0)
+
+
+class Vehicles:
+    """A simulation's answers about its vehicles."""
+
+    routes: ClassVar = {"way": ("west", "east"), "nowhere": ("gone",), "stops": ("west", "east")}
+
+    def route(self, vehicle: str) -> tuple[str, ...]:
+        return self.routes[vehicle]
+
+    def has_stop(self, vehicle: str) -> bool:
+        return vehicle == "stops"
+
+
+def test_who_cannot_be_planned_stays_human() -> None:
+    overrides = {"fleet.penetration": 1.0}
+    fleet = Fleet(prepare("stalled", "tests.scenarios.test_fleet:Straight", 0, overrides))
+    ids = ("way", "nowhere", "stops", "stalled")
+    states = np.array([[100.0 + 20.0 * i, -8.75, 0.0, 20.0] for i in range(4)])
+    scene = Scene(
+        1.0, CartesianState(50.0, -8.75, 0.0, 20.0), (5.0, 1.8), ids, states, np.full((4, 2), 2.0)
+    )
+    for _ in range(3):
+        fleet.meet(scene, Vehicles())
+        assert set(fleet.drive(scene)) == {"way"}
+    assert list(fleet.summary()["without_road"]) == ["nowhere"]
+    assert "gone" in fleet.summary()["without_road"]["nowhere"]
