@@ -73,6 +73,7 @@ benchmark-planner: $(VENV)/.installed
 benchmark: $(VENV)/.installed
 	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python benchmarks/rooms.py | tee benchmarks/rooms.txt
 	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -u -m benchmarks.batch | tee benchmarks/batch.txt
+	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -m benchmarks.fleet | tee benchmarks/fleet.txt
 
 wheel: $(VENV)/.installed
 	$(BIN)/python -m build --wheel

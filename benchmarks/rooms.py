@@ -46,9 +46,9 @@ def timed_rollout(scenario: str | Path, seed: int, overrides: dict[str, Any]) ->
     steps: list[float] = []
     original = Simulator.step
 
-    def step(self: Simulator, ego: Any) -> None:
+    def step(self: Simulator, ego: Any, others: Any) -> None:
         start = perf_counter()
-        original(self, ego)
+        original(self, ego, others)
         steps.append(1e3 * (perf_counter() - start))
 
     Simulator.step = step  # type: ignore[method-assign]

@@ -74,7 +74,7 @@ def test_scenario_page_shows_every_key_and_a_valid_file() -> None:
     Scenario.model_validate(data)
     fields = Scenario.model_fields
     assert set(data) == set(fields)
-    for name in ("ego", "sensing", "randomize"):
+    for name in ("ego", "sensing", "fleet", "randomize"):
         kind = fields[name].annotation
         assert kind is not None
         assert set(data[name]) == set(kind.model_fields)

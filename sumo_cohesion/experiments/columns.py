@@ -20,6 +20,7 @@ TRAJECTORY = (
     Column("time", "float64", "s", "SUMO time"),
     Column("vehicle", "string", "", "SUMO id; the ego is 'ego'"),
     Column("visible", "bool", "", "the ego's perception saw it"),
+    Column("planned", "bool", "", "a planner drove it in the step from here; else SUMO did"),
     Column("x", "float64", "m", "centre, east"),
     Column("y", "float64", "m", "centre, north"),
     Column("heading", "float64", "rad", "counter-clockwise from east"),
@@ -75,6 +76,7 @@ TIMING = (
     Column("social_ms", "float64", "ms", "groups, features, agreement"),
     Column("solver_ms", "float64", "ms", "inside the solver"),
     Column("plan_ms", "float64", "ms", "the planner's whole call"),
+    Column("fleet_ms", "float64", "ms", "perception and planning of all planned cars but the ego"),
     Column("sumo_ms", "float64", "ms", "SUMO's step, and reading the next scene"),
 )
 
@@ -153,6 +155,18 @@ METRICS = (
     Column("plan_failures", "int64", "", "steps driven by the fallback"),
     Column("plan_rescues", "int64", "", "steps in which the solver failed and IPOPT did not"),
     Column("interventions", "int64", "", "steps in which the last resort changed the control"),
+    Column(
+        "penetration",
+        "float64",
+        "",
+        "mean share of planned cars, ego included, among those in its range; no hidden, special",
+    ),
+    Column("fleet_size", "int64", "", "distinct cars that planners drove besides the ego"),
+    Column("fleet_collisions", "int64", "", "of these, how many touched something while planned"),
+    Column(
+        "fleet_interventions", "int64", "", "as interventions, over all planned cars but the ego"
+    ),
+    Column("fleet_failures", "int64", "", "as plan_failures, over all planned cars but the ego"),
     Column("plan_ms_median", "float64", "ms", "planner's call, median"),
     Column("plan_ms_p99", "float64", "ms", "planner's call, 99th percentile"),
 )

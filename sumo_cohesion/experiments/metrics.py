@@ -31,7 +31,9 @@ def run_metrics(
     """All metrics of one run: one row, see columns.METRICS."""
     ego = trajectory[trajectory["vehicle"] == _EGO]
     others = trajectory[trajectory["vehicle"] != _EGO]
-    humans = others[~others["vehicle"].isin([*info["hidden"], *info["special"]])]
+    # A planned car that has touched something is handed to SUMO, but is no human's to drive.
+    not_human = [*info["hidden"], *info["special"], *info["fleet"]["touched"]]
+    humans = others[~(others["vehicle"].isin(not_human) | others["planned"])]
     touched = info["touched"]
     start, end = ego["time"].iloc[0], ego["time"].iloc[-1]
     distance = float(ego["s"].iloc[-1] - ego["s"].iloc[0])
@@ -68,6 +70,7 @@ def run_metrics(
         "plan_failures": int(plan["fallback"].sum()),
         "plan_rescues": int(plan["status"].str.startswith(RESCUED).sum()),
         "interventions": int(plan["intervened"].sum()),
+        **fleet_metrics(info, ego, others),
         "plan_ms_median": float(timing["plan_ms"].median()),
         "plan_ms_p99": float(timing["plan_ms"].quantile(0.99)),
     }
@@ -247,7 +250,8 @@ def aside_share(info: Mapping[str, Any], ego: pd.DataFrame, others: pd.DataFrame
     if not info["special"]:
         return np.nan
     special = others[others["vehicle"] == info["special"][0]]
-    not_human = [*info["hidden"], *info["special"]]
+    planned = others["vehicle"][others["planned"]].unique()
+    not_human = [*info["hidden"], *info["special"], *planned]
     start = others[others["time"] == ego["time"].iloc[0]]
     lane = start["lane"] == ego["lane"].iloc[0]
     names = start["vehicle"][lane & ~start["vehicle"].isin(not_human)]
@@ -354,3 +358,25 @@ def human_metrics(humans: pd.DataFrame) -> dict[str, float]:
         brakes += int((hard & ~np.concatenate(([False], hard[:-1]))).sum())
     mean_speed = float(humans["speed"].mean()) if len(humans) else np.nan
     return {"human_mean_speed": mean_speed, "human_hard_brakes": brakes}
+
+
+def fleet_metrics(
+    info: Mapping[str, Any], ego: pd.DataFrame, others: pd.DataFrame
+) -> dict[str, float]:
+    """How many cars planners drove, and how these fared.
+
+    penetration: planned cars over all cars in the ego's sensing range, the ego among both,
+    hidden and special vehicles among neither; the mean over the steps driven.
+    """
+    driven = ego.iloc[:-1].set_index("time")["planned"]
+    seen = others[others["visible"] & ~others["vehicle"].isin(info["special"])]
+    by_time = seen.groupby("time")["planned"].agg(["sum", "size"]).reindex(driven.index)
+    count = by_time.fillna(0.0)
+    fleet = info["fleet"]
+    return {
+        "penetration": float(((count["sum"] + driven) / (count["size"] + 1.0)).mean()),
+        "fleet_size": int(others["vehicle"][others["planned"]].nunique()),
+        "fleet_collisions": len(fleet["touched"]),
+        "fleet_interventions": fleet["interventions"],
+        "fleet_failures": fleet["failures"],
+    }

@@ -6,8 +6,8 @@ import json
 import platform
 import shutil
 import tempfile
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -131,13 +131,24 @@ class Ending(NamedTuple):
     """How a run ended.
 
     ``touched`` are the vehicles the ego touched, ``touched_by_sumo`` those SUMO reports;
-    ``triggered`` is SUMO's time (s) of each of the scenario's events, by number.
+    ``triggered`` is SUMO's time (s) of each of the scenario's events, by number; ``fleet`` what
+    became of the other planned cars (Fleet.summary).
     """
 
     outcome: str
     touched: list[str]
     touched_by_sumo: list[str]
     triggered: dict[int, float]
+    fleet: dict[str, Any]
+
+
+class Seconds(NamedTuple):
+    """Wall time of one step: the ego's perception and planning, all other planned cars', SUMO's."""
+
+    perception: float
+    plan: float
+    fleet: float
+    sumo: float
 
 
 class Recorder:
@@ -149,8 +160,9 @@ class Recorder:
         self._reference = Reference(setup, sensor) if setup.scenario.reference else None
         self._scenes: list[Scene] = []
         self._visible: list[frozenset[str]] = []
+        self._planned: list[frozenset[str]] = []
         self._plans: list[tuple[float, RoadState, Plan]] = []
-        self._seconds: list[tuple[float, float, float]] = []
+        self._seconds: list[Seconds] = []
 
     def add(
         self,
@@ -158,21 +170,24 @@ class Recorder:
         observation: Observation,
         history: History,
         plan: Plan,
-        seconds: tuple[float, float, float],
+        others: Collection[str],
+        seconds: Seconds,
     ) -> None:
-        """Record one step; ``seconds`` spent on perception, planning and SUMO."""
+        """Record one step; ``others`` are the vehicles besides the ego that planners drive."""
         if self._reference is not None:
             self._reference.add(scene, observation, history, plan)
-        self._scenes.append(scene)
+        self._scenes.append(self._recorded(scene))
         self._visible.append(frozenset(observation.ids))
+        self._planned.append(frozenset((*others, EGO) if plan.controls else others))
         self._plans.append((scene.time, observation.ego, plan))
         self._seconds.append(seconds)
 
     def finish(self, last: Scene, ending: Ending) -> Rollout:
         """Build the rollout; ``last`` is the scene after the last step."""
         setup = self._setup
-        self._scenes.append(last)
+        self._scenes.append(self._recorded(last))
         self._visible.append(self._visible[-1])
+        self._planned.append(self._planned[-1])
         trajectory = self._trajectory(last.ego_size)
         rows = [] if self._reference is None else self._reference.rows
         reference = as_table("reference", rows)
@@ -187,6 +202,7 @@ class Recorder:
             "touched": ending.touched,
             "touched_by_sumo": ending.touched_by_sumo,
             "events": {str(number): time for number, time in ending.triggered.items()},
+            "fleet": ending.fleet,
             "hidden": list(setup.scenario.sensing.hidden),
             "special": list(setup.scenario.sensing.special),
             "solver": self._plans[0][2].solver if self._plans else "",
@@ -195,6 +211,15 @@ class Recorder:
         }
         metrics = run_metrics(info, trajectory, plan, agreement, timing, reference)
         return Rollout(info, trajectory, plan, agreement, timing, reference, metrics)
+
+    def _recorded(self, scene: Scene) -> Scene:
+        """Keep what is recorded: as far around the ego with a fleet as without."""
+        if not self._setup.penetration:
+            return scene
+        offset = scene.states[:, :2] - scene.ego[:2]
+        near = np.hypot(offset[:, 0], offset[:, 1]) <= self._setup.recorded_radius
+        ids = tuple([name for name, is_near in zip(scene.ids, near, strict=True) if is_near])
+        return replace(scene, ids=ids, states=scene.states[near], sizes=scene.sizes[near])
 
     def _trajectory(self, ego_size: tuple[float, float]) -> pd.DataFrame:
         counts = np.array([len(scene.ids) for scene in self._scenes])
@@ -206,13 +231,12 @@ class Recorder:
         times = np.array([scene.time for scene in self._scenes])
         step = np.arange(len(self._scenes))
         names = [name for scene in self._scenes for name in scene.ids]
-        seen = [
-            n in v for scene, v in zip(self._scenes, self._visible, strict=True) for n in scene.ids
-        ]
+        visible, planned = (self._is_among(sets) for sets in (self._visible, self._planned))
         columns = {
             "time": np.concatenate((times, np.repeat(times, counts))),
             "vehicle": [EGO] * len(egos) + names,
-            "visible": [True] * len(egos) + seen,
+            "visible": [True] * len(egos) + visible,
+            "planned": [EGO in names for names in self._planned] + planned,
             "x": states[:, 0],
             "y": states[:, 1],
             "heading": states[:, 2],
@@ -226,6 +250,12 @@ class Recorder:
         }
         order = np.argsort(np.concatenate((step, np.repeat(step, counts))), kind="stable")
         return as_table("trajectory", dict(columns)).iloc[order].reset_index(drop=True)
+
+    def _is_among(self, sets: list[frozenset[str]]) -> list[bool]:
+        """Of every other vehicle of every scene, whether it is in that scene's set."""
+        return [
+            n in among for scene, among in zip(self._scenes, sets, strict=True) for n in scene.ids
+        ]
 
     def _plan_table(self) -> pd.DataFrame:
         ego = np.array([state for _, state, _ in self._plans])
@@ -284,7 +314,7 @@ class Recorder:
         return as_table("agreement", rows)
 
     def _timing_table(self) -> pd.DataFrame:
-        milliseconds = 1e3 * np.array(self._seconds).reshape(-1, 3)
+        milliseconds = 1e3 * np.array(self._seconds).reshape(-1, len(Seconds._fields))
         return as_table(
             "timing",
             {
@@ -293,6 +323,7 @@ class Recorder:
                 "social_ms": [1e3 * plan.social_time for _, _, plan in self._plans],
                 "solver_ms": [1e3 * plan.wall_time for _, _, plan in self._plans],
                 "plan_ms": milliseconds[:, 1],
-                "sumo_ms": milliseconds[:, 2],
+                "fleet_ms": milliseconds[:, 2],
+                "sumo_ms": milliseconds[:, 3],
             },
         )

@@ -39,6 +39,17 @@ class Sensing(_Data):
     special: tuple[str, ...] = ()
 
 
+class FleetSettings(_Data):
+    """Which other cars the run's planner drives, too.
+
+    ``penetration``: the share of other cars that are equipped with the planner. They are driven
+    by it, each on its own, while they are within the ego's sensing range; elsewhere SUMO drives
+    them. The sets are nested: who is equipped at 0.2 is equipped at 0.5.
+    """
+
+    penetration: Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)] = 0.0
+
+
 class Bounds(_Data):
     """A metric lies between ``min`` and ``max``, both included."""
 
@@ -62,6 +73,7 @@ class Scenario(_Data):
     duration : seconds after the ego's departure.
     lateral_resolution : width (m) of SUMO's sublanes.
     human_type : SUMO vType attributes, set on the types of all humans.
+    fleet : which other cars the run's planner drives, too.
     events : what humans are told, and when, where SUMO has no such rule.
     reference : also drive a nominal twin beside the ego, for the metrics that compare with it
         (experiments.reference); it costs two more plans per step.
@@ -77,6 +89,7 @@ class Scenario(_Data):
     lateral_resolution: Annotated[float, Field(gt=0, le=10)] = 0.8
     ego: EgoDemand
     sensing: Sensing = Sensing()
+    fleet: FleetSettings = FleetSettings()
     randomize: Randomization = Randomization()
     human_type: dict[str, float | str] = {}
     events: tuple[Event, ...] = ()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -23,6 +23,9 @@ from sumo_cohesion.traffic.demand import (
 from sumo_cohesion.traffic.network import Network
 from sumo_cohesion.traffic.outputs import SumoOutputs
 from sumo_cohesion.traffic.simulator import SumoRun
+
+_MARGIN = 50.0
+"""Metres beyond the sensing range that are read and recorded, too."""
 
 
 @dataclass(frozen=True)
@@ -54,6 +57,33 @@ class Setup(Inputs):
     def not_human(self) -> set[str]:
         """Vehicles that the scenario hides or calls special: a stalled car, an ambulance."""
         return {*self.scenario.sensing.hidden, *self.scenario.sensing.special}
+
+    @property
+    def ego_size(self) -> tuple[float, float]:
+        """Length, width (m) of the ego."""
+        return self.scenario.ego.length, self.scenario.ego.width
+
+    @property
+    def penetration(self) -> float:
+        """Share of other cars that the planner drives; none if the planner is SUMO itself."""
+        return 0.0 if self.planner_name == "sumo" else self.scenario.fleet.penetration
+
+    @property
+    def recorded_radius(self) -> float:
+        """Metres around the ego within which vehicles are recorded."""
+        return self.scenario.sensing.range + _MARGIN
+
+    @property
+    def read_radius(self) -> float:
+        """Metres around the ego within which vehicles are read from SUMO.
+
+        With a fleet, all that a planned car at the edge of the ego's range senses.
+        """
+        return self.recorded_radius + (self.scenario.sensing.range if self.penetration else 0.0)
+
+    def road_along(self, route: Sequence[str]) -> Road:
+        """Road along any route of this network; raises UserError if no car can drive along it."""
+        return _road(self.network, *_version(self.network), tuple(route))
 
     def write_inputs(self, folder: Path, gui: bool = False) -> SumoRun:
         """Write this seed's demand and return what SUMO needs."""
@@ -132,6 +162,6 @@ def _network(path: Path, _changed: int, _size: int) -> Network:
     return Network(path)
 
 
-@lru_cache(maxsize=16)
+@lru_cache(maxsize=64)
 def _road(path: Path, changed: int, size: int, route: tuple[str, ...]) -> Road:
     return _network(path, changed, size).road(route)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -10,29 +9,24 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
+from sumo_cohesion.experiments.drive import END_OF_ROUTE, ask, drive
+from sumo_cohesion.experiments.fleet import Fleet
 from sumo_cohesion.experiments.rollout import (
     RUN_FILE,
     Ending,
     Recorder,
     Rollout,
+    Seconds,
     require_replaceable,
 )
 from sumo_cohesion.experiments.setup import Setup, prepare
-from sumo_cohesion.perception.history import History
 from sumo_cohesion.perception.observation import Sensor
-from sumo_cohesion.planning import dynamics
-from sumo_cohesion.planning.fallback import fallback
 from sumo_cohesion.planning.planners import Planner, make_planner
-from sumo_cohesion.planning.settings import PlannerSettings
 from sumo_cohesion.social.memory import new_history
-from sumo_cohesion.state import CartesianState, Observation, Plan, Scene
 from sumo_cohesion.traffic.contact import contacts
 from sumo_cohesion.traffic.drivers import Drivers
 from sumo_cohesion.traffic.outputs import Output, SumoOutputs
 from sumo_cohesion.traffic.simulator import STEP_LENGTH, Simulator
-
-END_OF_ROUTE = 20.0
-"""Metres before the end of the route at which a run is over; SUMO would remove the ego there."""
 
 
 def run(
@@ -92,63 +86,50 @@ def simulate_with_outputs(
 
 def simulate(setup: Setup, planner: Planner, *, gui: bool = False) -> Rollout:
     """Run the loop: observe, remember, plan, drive, step SUMO; until contact or the end."""
-    scenario, road = setup.scenario, setup.road
-    sensing, size = scenario.sensing, (scenario.ego.length, scenario.ego.width)
+    scenario, road, sensing = setup.scenario, setup.road, setup.scenario.sensing
     sensor = Sensor(road, sensing.range, sensing.hidden, sensing.special)
     history = new_history(setup.cohesion, STEP_LENGTH)
-    recorder = Recorder(setup, sensor)
+    recorder, fleet = Recorder(setup, sensor), Fleet(setup)
     planner.reset(road)
     with (
         tempfile.TemporaryDirectory() as folder,
-        Simulator(setup.write_inputs(Path(folder), gui), size, sensing.range + 50.0) as sumo,
+        Simulator(setup.write_inputs(Path(folder), gui), setup.ego_size, setup.read_radius) as sumo,
     ):
         scene = sumo.insert_ego(latest=scenario.ego.depart + 60.0)
         drivers = Drivers(scenario.events, setup.not_human, setup.seed, scene.time)
         end, outcome = scene.time + scenario.duration, ""
         while not outcome:
+            fleet.meet(scene, sumo)
             t0 = perf_counter()
-            observation = sensor.observe(scene)
+            observation = sensor.observe(scene, fleet.not_followed)
             history.push(observation)
             t1 = perf_counter()
-            plan = _plan(planner, observation, history, setup)
+            plan = ask(planner, observation, history, road, setup.settings)
             t2 = perf_counter()
-            ego = _drive(scene, plan, setup.settings)
-            drivers.act(scene.time, sumo)
-            sumo.step(ego)
-            following = sumo.read()
+            others = fleet.drive(scene)
             t3 = perf_counter()
-            recorder.add(scene, observation, history, plan, (t1 - t0, t2 - t1, t3 - t2))
+            ego = drive(scene.ego, plan, setup.settings)
+            drivers.act(scene.time, sumo, others)
+            sumo.step(ego, others)
+            following = sumo.read()
+            seconds = Seconds(t1 - t0, t2 - t1, t3 - t2, perf_counter() - t3)
+            recorder.add(scene, observation, history, plan, others, seconds)
             scene = following
             touched = contacts(scene.ego, scene.ego_size, scene.states, scene.sizes)
-            if touched.size:
-                outcome = "collision"
-            elif observation.ego.s > road.length - END_OF_ROUTE:
-                outcome = "route_end"
-            elif scene.time > end - STEP_LENGTH / 2:
-                outcome = "finished"
+            at_end = observation.ego.s > road.length - END_OF_ROUTE
+            outcome = _outcome(bool(touched.size), at_end, scene.time > end - STEP_LENGTH / 2)
+        fleet.meet(scene, sumo)  # who touched whom in the last step
         names = [scene.ids[i] for i in touched]
-        ended = Ending(outcome, names, sumo.reported_contacts(), drivers.triggered)
-        return recorder.finish(scene, ended)
+        told = sumo.reported_contacts()
+        return recorder.finish(
+            scene, Ending(outcome, names, told, drivers.triggered, fleet.summary())
+        )
 
 
-def _plan(planner: Planner, observation: Observation, history: History, setup: Setup) -> Plan:
-    """Ask the planner; whatever goes wrong in it, the ego gets a plan and it is counted."""
-    try:
-        plan = planner.plan(observation, history)
-        usable = all(math.isfinite(v) for control in plan.controls[:1] for v in control)
-        status = "control is not finite"
-    except MemoryError:
-        raise  # a car cannot drive on without memory; the run ends
-    except Exception as error:
-        usable, status = False, f"{type(error).__name__}: {error}"
-    return plan if usable else fallback(observation, setup.road, setup.settings, status)
-
-
-def _drive(scene: Scene, plan: Plan, settings: PlannerSettings) -> CartesianState | None:
-    """Where the first planned control takes the ego; None if SUMO drives it."""
-    if not plan.controls:
-        return None
-    x, y, heading, speed = dynamics.step(
-        scene.ego, plan.controls[0], STEP_LENGTH, settings.friction
-    )
-    return CartesianState(float(x), float(y), float(heading), max(float(speed), 0.0))
+def _outcome(touched: bool, at_end: bool, finished: bool) -> str:
+    """Why the run ends here; empty if it goes on."""
+    if touched:
+        return "collision"
+    if at_end:
+        return "route_end"
+    return "finished" if finished else ""

@@ -21,13 +21,15 @@ State = tuple[float, float, float, float]
 Describe = Callable[[State, State, float, float], Features]
 """Features of a transition: (before, after, seconds between, road curvature)."""
 
+_NONE = range(0)
+
 
 class Track:
     """One car's transitions (x_t, x_t+1), oldest first.
 
     Attributes
     ----------
-    voter : False for special vehicles, which nobody follows.
+    voter : False for special vehicles, which nobody follows: no new transition is remembered.
     state : where the car was seen last.
     step : when it was seen last, in steps.
     steps, middle_s, middle_d, features, habits : of each remembered transition: the step it
@@ -103,8 +105,11 @@ class Track:
 
     def passed(self, s: float, reach: float) -> range:
         """Which transitions have their middle within ``reach`` (m) of s; cars do not reverse."""
-        first = bisect_left(self.middle_s, s - reach)
-        return range(first, bisect_right(self.middle_s, s + reach, first))
+        middle_s = self.middle_s
+        if not middle_s or middle_s[-1] < s - reach or middle_s[0] > s + reach:
+            return _NONE  # most cars, most of the time
+        first = bisect_left(middle_s, s - reach)
+        return range(first, bisect_right(middle_s, s + reach, first))
 
     def passed_by(self, s: float) -> bool:
         """Tell whether the car was seen on both sides of s, driving forwards."""
@@ -212,7 +217,11 @@ class History:
             track = self._tracks.get(name)
             if track is None:
                 track = self._tracks[name] = Track(self._lag, self._habit())
+            in_sight.append(track)
             track.voter = voter
+            if not voter:
+                track.step, track.state = self._now, state
+                continue
             track.see(
                 self._now,
                 state,
@@ -221,7 +230,6 @@ class History:
                 self._interval,
                 self._describe,
             )
-            in_sight.append(track)
         self._in_sight = in_sight
 
     def _forget(self) -> None:

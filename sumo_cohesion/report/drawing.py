@@ -74,8 +74,11 @@ def ego_colour(rollout: Rollout) -> str:
 def humans_of(rollout: Rollout) -> pd.DataFrame:
     """Rows of the trajectory that are human drivers'."""
     info = rollout.info
-    others = {"ego", *info["hidden"], *info["special"]}
-    return rollout.trajectory[~rollout.trajectory["vehicle"].isin(others)]
+    table = rollout.trajectory
+    others = table["vehicle"].isin({"ego", *info["hidden"], *info["special"]})
+    if "planned" in table:  # runs from before there were fleets have no such column
+        others |= table["planned"]
+    return table[~others]
 
 
 def ending(rollout: Rollout) -> str:

@@ -40,6 +40,8 @@ class CohesionSettings(BaseModel):
     position_length, position_width : half sizes (m) of the position group's box.
     lane_ahead, lane_behind : reach (m) of the lane group.
     road_reach : reach (m) of the road group, ahead and behind.
+    follow_egos : whether other cars that a planner drives ([fleet] of a scenario) vote like
+        humans; False: only humans are followed, which is the paper's idea.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -63,6 +65,7 @@ class CohesionSettings(BaseModel):
     lane_ahead: Positive = 60.0
     lane_behind: NonNegative = 20.0
     road_reach: Positive = 60.0
+    follow_egos: bool = False
 
 
 def as_printed(cohesion: CohesionSettings) -> CohesionSettings:

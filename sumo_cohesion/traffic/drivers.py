@@ -112,11 +112,15 @@ class Drivers:
         self.triggered: dict[int, float] = {}
         """SUMO's time (s) at which each event was first triggered, by its number."""
 
-    def act(self, time: float, sumo: Commands) -> None:
-        """Give the orders that are due; call it once per step, before the step."""
+    def act(self, time: float, sumo: Commands, planned: Collection[str] = ()) -> None:
+        """Give the orders that are due; call it once per step, before the step.
+
+        ``planned`` are vehicles that planners drive: no human is there to be told. If a human
+        takes over again, it hears then what is still to be done.
+        """
         if not self._events:
             return
-        vehicles = sumo.vehicles()
+        vehicles = [name for name in sumo.vehicles() if name not in planned]
         for number, event in enumerate(self._events):
             if number not in self.triggered and self._is_triggered(event, time, sumo):
                 self.triggered[number] = time

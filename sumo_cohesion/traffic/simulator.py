@@ -1,4 +1,4 @@
-"""The bridge: start SUMO, read a Scene, put the ego where its planner drove it, step, close.
+"""The bridge: start SUMO, read a Scene, put cars where their planners drove them, step, close.
 
 libsumo: https://sumo.dlr.de/docs/Libsumo.html
 moveToXY: https://sumo.dlr.de/docs/TraCI/Change_Vehicle_State.html#move_to_xy_0xb4
@@ -7,11 +7,12 @@ moveToXY: https://sumo.dlr.de/docs/TraCI/Change_Vehicle_State.html#move_to_xy_0x
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Mapping
 from dataclasses import dataclass
 from math import cos, degrees, hypot, inf, isfinite, pi, radians, sin
 from pathlib import Path
-from types import TracebackType
-from typing import Any
+from types import MappingProxyType, TracebackType
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -24,12 +25,22 @@ from sumo_cohesion.traffic.outputs import SumoOutputs
 STEP_LENGTH = 0.1
 """Seconds per step, of SUMO and of every planner."""
 _POSITION_TOLERANCE = 0.05
-"""Metres by which SUMO's ego may differ from the driven one. Measured: below 0.001."""
+"""Metres by which SUMO's car may differ from the driven one. Measured: below 0.001."""
 _KEEP_ROUTE_EXACT = 2
 """moveToXY: put the ego exactly there, map it to whatever lane is below, or to none."""
 _SPEED_FACTOR = 3.0
+_NO_OTHERS: Mapping[str, CartesianState] = MappingProxyType({})
 
 _running: str | None = None
+
+
+class _Manners(NamedTuple):
+    """How SUMO drove a car before it was taken over: what it gets back."""
+
+    max_speed: float
+    speed_factor: float
+    speed_mode: int
+    lane_change_mode: int
 
 
 @dataclass(frozen=True)
@@ -92,15 +103,16 @@ class Simulator:
     UserError
         If SUMO rejects the network or the demand.
     SimulationError
-        If SUMO's ego is not where it was put, or has gone.
+        If a car is not where it was put, or the ego has gone.
     """
 
     def __init__(self, run: SumoRun, ego_size: tuple[float, float], radius: float) -> None:
         self._run = run
         self._ego_size = ego_size
         self._radius = radius
-        self._sizes: dict[str, tuple[float, float]] = {}
-        self._driven: CartesianState | None = None
+        self._sizes = {EGO: ego_size}
+        self._driven: dict[str, CartesianState] = {}
+        self._manners: dict[str, _Manners] = {}
         self._stepped = True
         self._sumo: Any = None
         self._variables: tuple[int, ...] = ()
@@ -161,71 +173,120 @@ class Simulator:
         )
         return self.read()
 
-    def _take_over(self) -> None:
-        """Switch off SUMO's own control of the ego, unless it is off.
+    def _take_over(self, name: str) -> None:
+        """Switch off SUMO's own control of a car, unless it is off.
 
-        A high speed factor matters: SUMO reports an ego moved faster than its lane's limit
+        A high speed factor matters: SUMO reports a car moved faster than its lane's limit
         times that factor at the capped speed, and humans follow what is reported. SUMO's
         bluelight device takes the factor away again from a car that it no longer influences.
         """
-        if self._sumo.vehicle.getSpeedFactor(EGO) == _SPEED_FACTOR:
-            return
         vehicle = self._sumo.vehicle
-        # In this order: setMaxSpeed gives the ego a type of its own, with speed factor 1.
-        vehicle.setMaxSpeed(EGO, 70.0)
-        vehicle.setSpeedFactor(EGO, _SPEED_FACTOR)
-        vehicle.setSpeedMode(EGO, 0)
-        vehicle.setLaneChangeMode(EGO, 0)
+        factor = vehicle.getSpeedFactor(name)
+        if name not in self._manners:
+            self._manners[name] = _Manners(
+                vehicle.getMaxSpeed(name),
+                factor,
+                vehicle.getSpeedMode(name),
+                vehicle.getLaneChangeMode(name),
+            )
+        elif factor == _SPEED_FACTOR:
+            return
+        self._give(name, _Manners(70.0, _SPEED_FACTOR, 0, 0))
 
-    def step(self, ego: CartesianState | None) -> None:
-        """Advance SUMO by one step, with the ego at the given state (None: SUMO drives it)."""
-        if ego is not None:
-            if not all(map(isfinite, ego)):
-                raise SimulationError(f"the ego would be moved to a place that is no number: {ego}")
-            self._take_over()
-            # SUMO's angles are degrees clockwise from north; its positions are front bumpers.
-            half = self._ego_size[0] / 2
-            front = ego.x + half * cos(ego.heading), ego.y + half * sin(ego.heading)
-            angle = (90.0 - degrees(ego.heading)) % 360.0
-            self._sumo.vehicle.moveToXY(EGO, "", -1, *front, angle, _KEEP_ROUTE_EXACT)
-            self._stepped = False
-        self._driven = ego
+    def release(self, name: str) -> None:
+        """Give a car back to SUMO as it was taken; `step` does so with all it does not move.
+
+        SUMO drives on from where the car is, into its lane's centre if it is beside it. A car
+        beside the road has no lane to drive on, and SUMO takes it out of the simulation.
+        """
+        manners = self._manners.pop(name, None)
+        if manners is not None and name in self._sumo.vehicle.getIDList():
+            self._give(name, manners)
+
+    def _give(self, name: str, manners: _Manners) -> None:
+        vehicle = self._sumo.vehicle
+        # In this order: setMaxSpeed gives the car a type of its own, with speed factor 1.
+        vehicle.setMaxSpeed(name, manners.max_speed)
+        vehicle.setSpeedFactor(name, manners.speed_factor)
+        vehicle.setSpeedMode(name, manners.speed_mode)
+        vehicle.setLaneChangeMode(name, manners.lane_change_mode)
+
+    def step(
+        self, ego: CartesianState | None, others: Mapping[str, CartesianState] = _NO_OTHERS
+    ) -> None:
+        """Advance SUMO by one step, with the ego and some others at the given states.
+
+        SUMO drives all that are not given; the ego, too, if it is None.
+        """
+        driven = dict(others) if ego is None else {EGO: ego, **others}
+        for name, state in driven.items():
+            if not all(map(isfinite, state)):
+                called = "the ego" if name == EGO else f"vehicle {name!r}"
+                raise SimulationError(
+                    f"{called} would be moved to a place that is no number: {state}"
+                )
+        for name in [name for name in self._manners if name not in driven]:
+            self.release(name)
+        for name, state in driven.items():
+            self._take_over(name)
+            self._move(name, state)
+        self._driven = driven
         self._step()
+
+    def _move(self, name: str, state: CartesianState) -> None:
+        # SUMO's angles are degrees clockwise from north; its positions are front bumpers.
+        half = self._size(name)[0] / 2
+        front = state.x + half * cos(state.heading), state.y + half * sin(state.heading)
+        angle = (90.0 - degrees(state.heading)) % 360.0
+        self._sumo.vehicle.moveToXY(name, "", -1, *front, angle, _KEEP_ROUTE_EXACT)
+        self._stepped = False
 
     def read(self) -> Scene:
         """Read what is around the ego now."""
         vehicle = self._sumo.vehicle
         found = vehicle.getContextSubscriptionResults(EGO)
         position, angle, speed = self._variables
-        if EGO in found:
-            own = found.pop(EGO)
-        elif EGO in vehicle.getIDList():
-            # Beside the road SUMO's search around the ego does not find the ego itself.
-            own = {position: vehicle.getPosition(EGO), angle: vehicle.getAngle(EGO), speed: 0.0}
-        else:
-            raise SimulationError("SUMO has removed the ego; it came to the end of its route")
-        ego = self._centre(own[position], own[angle], own[speed], self._ego_size[0])
-        if self._driven is not None:
-            error = hypot(ego.x - self._driven.x, ego.y - self._driven.y)
-            if not error < _POSITION_TOLERANCE:
-                raise SimulationError(
-                    f"SUMO's ego is {error:.2f} m from where it was driven to; the bridge is broken"
-                )
-            # SUMO's speed is the same to rounding; its heading is that of the last move.
-            ego = self._driven
-        ids = tuple(found)
-        states = [
-            self._centre(row[position], row[angle], row[speed], self._size(name)[0])
+        present: set[str] | None = None
+        for name in (EGO, *self._driven):
+            if name in found:
+                continue
+            present = set(vehicle.getIDList()) if present is None else present
+            if name in present:
+                # Beside the road SUMO's search around the ego finds neither the ego nor others.
+                at = vehicle.getPosition(name)
+                found[name] = {position: at, angle: vehicle.getAngle(name), speed: 0.0}
+            elif name == EGO:
+                raise SimulationError("SUMO has removed the ego; it came to the end of its route")
+        cars = {
+            name: self._centre(row[position], row[angle], row[speed], self._size(name)[0])
             for name, row in found.items()
-        ]
+        }
+        for name, driven in self._driven.items():
+            if name in cars:
+                # SUMO's speed is the same to rounding; its heading is that of the last move.
+                cars[name] = self._where_it_was_put(name, cars[name], driven)
+        ego = cars.pop(EGO)
         return Scene(
             time=float(self._sumo.simulation.getTime()),
             ego=ego,
             ego_size=self._ego_size,
-            ids=ids,
-            states=np.array(states, dtype=float).reshape(-1, 4),
-            sizes=np.array([self._sizes[name] for name in ids], dtype=float).reshape(-1, 2),
+            ids=tuple(cars),
+            states=np.array(list(cars.values()), dtype=float).reshape(-1, 4),
+            sizes=np.array([self._sizes[name] for name in cars], dtype=float).reshape(-1, 2),
         )
+
+    @staticmethod
+    def _where_it_was_put(
+        name: str, found: CartesianState, driven: CartesianState
+    ) -> CartesianState:
+        error = hypot(found.x - driven.x, found.y - driven.y)
+        if not error < _POSITION_TOLERANCE:
+            called = "ego" if name == EGO else f"vehicle {name!r}"
+            raise SimulationError(
+                f"SUMO's {called} is {error:.2f} m from where it was driven to; "
+                "the bridge is broken"
+            )
+        return driven
 
     def reported_contacts(self) -> list[str]:
         """Vehicles that SUMO itself says the ego touched in the last step."""
@@ -235,6 +296,14 @@ class Simulator:
     def vehicles(self) -> list[str]:
         """Ids of all vehicles on the road, the ego's excluded."""
         return [name for name in self._sumo.vehicle.getIDList() if name != EGO]
+
+    def route(self, vehicle: str) -> tuple[str, ...]:
+        """Edges of a vehicle's route."""
+        return tuple(self._sumo.vehicle.getRoute(vehicle))
+
+    def has_stop(self, vehicle: str) -> bool:
+        """Tell whether a vehicle stands at a stop of its route, or has one before it."""
+        return bool(self._sumo.vehicle.getStops(vehicle, 1))
 
     def distance_to_ego(self, vehicle: str) -> float:
         """Metres between a vehicle and the ego; infinite if it is not there."""

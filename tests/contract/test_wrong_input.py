@@ -103,6 +103,9 @@ ROUTES = (ROOT / "routes" / "stalled.rou.xml").read_text()
         ("[success]", "[human_type]\nlcSigma = nan\n[success]", ["human_type.lcSigma", "finite"]),
         ("[success]", "[human_type]\nlcSigma = 'x'\n[success]", ["lcSigma"]),
         ("[success]", "[human_type]\nlcSigma = [1]\n[success]", ["human_type.lcSigma", "number"]),
+        ("[success]", "[fleet]\npenetration = 1.5\n[success]", ["fleet.penetration", "1.5"]),
+        ("[success]", "[fleet]\npenetration = nan\n[success]", ["fleet.penetration", "nan"]),
+        ("[success]", "[fleet]\nshare = 0.5\n[success]", ["fleet.share", "penetration"]),
         ("[ego]", "[ego", ["not valid TOML"]),
     ],
 )

@@ -117,6 +117,89 @@ def test_a_place_that_is_no_number_never_reaches_sumo(tmp_path: Path) -> None:
             sumo.step(ego._replace(x=float("nan")))
 
 
+def ahead(state: np.ndarray, metres: float, aside: float = 0.0) -> CartesianState:
+    """Where a car is after so many metres, at the speed that takes."""
+    return CartesianState(state[0] + metres, state[1] + aside, 0.0, 10.0 * metres)
+
+
+def test_several_cars_are_where_they_were_put_and_driven_on_by_sumo_afterwards(
+    tmp_path: Path,
+) -> None:
+    slow = vehicle("b", 0, 160, 20).replace(">", ' speedFactor="0.8">', 1)
+    with simulation(
+        tmp_path,
+        vehicle("ego", 1, 100, 25),
+        slow,
+        vehicle("c", 2, 130, 25),
+        vehicle("d", 0, 60, 20),
+    ) as sumo:
+        scene = sumo.insert_ego(latest=5.0)
+        before = sumo._sumo.vehicle
+        manners = [
+            before.getMaxSpeed("b"),
+            before.getSpeedFactor("b"),
+            before.getSpeedMode("b"),
+            before.getLaneChangeMode("b"),
+        ]
+        for _ in range(30):
+            now = dict(zip(scene.ids, scene.states, strict=True))
+            moves = {"b": ahead(now["b"], 3.0, 0.05), "c": ahead(now["c"], 2.0)}
+            sumo.step(ahead(np.array(scene.ego), 2.5), moves)
+            scene = sumo.read()  # raises if one is elsewhere
+            for name, row in zip(scene.ids, scene.states, strict=True):
+                if name in moves:
+                    assert tuple(row) == moves[name]
+        assert before.getSpeed("b") == pytest.approx(30.0, abs=0.05)
+        released = dict(zip(scene.ids, scene.states, strict=True))["b"]
+        for k in range(60):
+            sumo.step(ahead(np.array(scene.ego), 2.5))
+            scene = sumo.read()
+            b = dict(zip(scene.ids, scene.states, strict=True))["b"]
+            if k == 0:
+                assert b[:2] == pytest.approx([released[0] + 3.0, released[1]], abs=0.5)
+        # SUMO has slowed it down to what it wants, in the lane it was left in.
+        assert b[3] == pytest.approx(20.0, abs=0.1)
+        assert b[1] == pytest.approx(-8.75, abs=1.0) or b[1] == pytest.approx(-5.25, abs=0.1)
+        v = sumo._sumo.vehicle
+        after = [f("b") for f in (v.getMaxSpeed, v.getSpeedFactor, v.getSpeedMode)]
+        assert [*after, v.getLaneChangeMode("b")] == pytest.approx(manners)
+
+
+def test_another_car_that_is_not_where_it_was_put_is_an_error(tmp_path: Path) -> None:
+    with simulation(tmp_path, vehicle("ego", 1, 100, 25), vehicle("b", 2, 160, 20)) as sumo:
+        scene = sumo.insert_ego(latest=5.0)
+        there = ahead(scene.states[0], 2.0)
+        with pytest.raises(SimulationError, match=r"vehicle 'b' would be moved to .* no number"):
+            sumo.step(scene.ego, {"b": there._replace(heading=float("inf"))})
+        sumo.step(scene.ego, {"b": there})
+        sumo._driven["b"] = there._replace(x=there.x + 1.0)
+        with pytest.raises(SimulationError, match=r"vehicle 'b' is 1\.00 m from where it was"):
+            sumo.read()
+
+
+def test_another_car_beside_the_road_is_still_seen_until_sumo_has_it_again(tmp_path: Path) -> None:
+    with simulation(tmp_path, vehicle("ego", 1, 100, 25), vehicle("b", 0, 160, 25)) as sumo:
+        scene = sumo.insert_ego(latest=5.0)
+        for _ in range(30):
+            there = ahead(scene.states[0], 2.5, -0.3)
+            sumo.step(ahead(np.array(scene.ego), 2.5), {"b": there})
+            scene = sumo.read()
+            assert scene.ids == ("b",)
+            assert tuple(scene.states[0]) == there
+        sumo.step(ahead(np.array(scene.ego), 2.5))
+        assert sumo.read().ids == ()  # it had no lane to drive on
+        sumo.step(ahead(np.array(scene.ego), 5.0))  # and the simulation goes on
+
+
+def test_orders_from_before_do_not_move_a_car_that_is_put(tmp_path: Path) -> None:
+    with simulation(tmp_path, vehicle("ego", 2, 100, 25), vehicle("b", 0, 160, 25)) as sumo:
+        scene = sumo.insert_ego(latest=5.0)
+        sumo.order_lane("b", 2, 30.0)
+        for _ in range(20):
+            sumo.step(ahead(np.array(scene.ego), 2.5), {"b": ahead(scene.states[0], 2.5)})
+            scene = sumo.read()
+
+
 def test_one_simulation_per_process(tmp_path: Path) -> None:
     with simulation(tmp_path, vehicle("ego", 1, 100, 25)) as sumo:
         sumo.insert_ego(latest=5.0)

@@ -76,6 +76,14 @@ def test_repeated_orders_keep_their_intervals_and_bounds() -> None:
         assert 0.3 < (values > 0).mean() < 0.7
 
 
+def test_who_is_planned_hears_what_is_due_when_a_human_drives_again() -> None:
+    sumo, drivers = Recording(), Drivers([Event(at=0.0, lane=0)], {"ambulance"}, 0, start=0.0)
+    for k in range(50):
+        sumo.time = round(0.1 * k, 1)
+        drivers.act(sumo.time, sumo, planned={"b"} if k < 30 else ())
+    assert [(time, name) for time, name, *_ in sumo.orders] == [(0.0, "a"), (0.0, "c"), (3.0, "b")]
+
+
 def test_the_same_seed_gives_the_same_orders_whoever_else_is_there() -> None:
     event = Event(every=(2.0, 4.0), speed_factor=(0.75, 1.2))
     all_orders = [o for o in act(event, 20.0, seed=5).orders if o[1] == "b"]

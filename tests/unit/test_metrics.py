@@ -17,6 +17,7 @@ def car(name: str, s: np.ndarray, d: float = 0.0, dt: float = 0.1) -> pd.DataFra
         {
             "time": np.round(dt * np.arange(n), 6),
             "vehicle": name,
+            "planned": False,
             "s": s,
             "d": np.full(n, d),
             "speed": speed,
@@ -242,3 +243,26 @@ def test_aside_share_does_without_a_human_that_was_out_of_sight_too_soon() -> No
     gone = car("gone", 300.0 + 20.0 * TIME)[:3]
     others = pd.concat([ambulance[5:], human, gone])
     assert metrics.aside_share(RESCUE, ego, others) == pytest.approx(0.5)
+
+
+def test_fleet_metrics_by_hand() -> None:
+    ego = car("ego", 20.0 * TIME[:5]).assign(planned=True)
+    always = car("a", 10.0 + 20.0 * TIME[:5]).assign(planned=True, visible=True)
+    half = car("b", 20.0 + 20.0 * TIME[:5]).assign(
+        planned=[True, True, False, False, False], visible=[True, True, True, False, False]
+    )
+    special = car("s", 30.0 + 20.0 * TIME[:5]).assign(visible=True)
+    hidden = car("h", 40.0 + 20.0 * TIME[:5]).assign(visible=False)
+    fleet = {"touched": {"b": ["h"]}, "interventions": 3, "failures": 2}
+    info = {"special": ["s"], "hidden": ["h"], "fleet": fleet}
+    result = metrics.fleet_metrics(info, ego, pd.concat([always, half, special, hidden]))
+    # Four steps: 3/3, 3/3, 2/3 and, with b out of sight, 2/2; none follows the last row.
+    assert result == {
+        "penetration": pytest.approx((1.0 + 1.0 + 2 / 3 + 1.0) / 4),
+        "fleet_size": 2,
+        "fleet_collisions": 1,
+        "fleet_interventions": 3,
+        "fleet_failures": 2,
+    }
+    alone = metrics.fleet_metrics(info, ego, pd.concat([hidden]))
+    assert alone["penetration"] == 1.0

@@ -1,0 +1,188 @@
+"""Cost of a hundred planned cars at once, beside SUMO's step: wall time per step.
+
+    python -m benchmarks.fleet [--planner cohesive] [--seconds 20] [--follow-egos]
+
+A dense five-lane highway on which every car is equipped; only steps in which at least a hundred
+cars besides the ego are planned count. ``fleet_ms`` is the column of the timing table: perception,
+social and planning of all of them, one after the other in one process.
+"""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import tempfile
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from resource import RUSAGE_SELF, getrusage
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from sumo_cohesion.experiments import fleet as fleet_module
+from sumo_cohesion.experiments.fleet import Fleet
+from sumo_cohesion.experiments.rollout import Rollout, versions
+from sumo_cohesion.experiments.setup import prepare
+from sumo_cohesion.experiments.simulation import simulate
+from sumo_cohesion.perception.observation import Overview
+from sumo_cohesion.planning.planners import make_planner
+
+LANES, SPACING, AT_LEAST = 5, 16.0, 100
+SCENARIO = """
+name = "crowd"
+summary = "A dense highway on which a planner drives every car."
+network = "crowd.net.xml"
+routes = ["crowd.rou.xml"]
+duration = {duration}
+[ego]
+origin = "e0"
+destination = "e{last}"
+lane = 2
+position = {position}
+speed = 15.0
+[sensing]
+range = 200.0
+[fleet]
+penetration = 1.0
+[success]
+collision = false
+"""
+
+
+def write_crowd(folder: Path, seconds: float) -> Path:
+    """Write a straight highway in 1 km edges, filled for a kilometre, the ego in its middle."""
+    n = int(seconds * 20 / 1000) + 3
+    nodes = "".join(f'<node id="n{i}" x="{1000 * i}" y="0"/>' for i in range(n + 1))
+    edges = "".join(
+        f'<edge id="e{i}" from="n{i}" to="n{i + 1}" numLanes="{LANES}" width="3.5" speed="15"/>'
+        for i in range(n)
+    )
+    (folder / "crowd.nod.xml").write_text(f"<nodes>{nodes}</nodes>")
+    (folder / "crowd.edg.xml").write_text(f"<edges>{edges}</edges>")
+    options = ["--offset.disable-normalization", "true", "--no-turnarounds", "true"]
+    files = ["-n", "crowd.nod.xml", "-e", "crowd.edg.xml", "-o", "crowd.net.xml"]
+    subprocess.run(["netconvert", *files, *options], cwd=folder, check=True, capture_output=True)
+    rng = np.random.default_rng(0)
+    places = np.arange(20.0, 990.0, SPACING)
+    middle = places.size // 2
+    cars = "".join(
+        f'<vehicle id="c{lane}_{i}" type="human" route="all" depart="0" departLane="{lane}" '
+        f'departPos="{place + rng.uniform(-2.0, 2.0):.2f}" departSpeed="15" '
+        'insertionChecks="none"/>'
+        for lane in range(LANES)
+        for i, place in enumerate(places)
+        if (lane, i) != (2, middle)
+    )
+    route = " ".join(f"e{i}" for i in range(n))
+    (folder / "crowd.rou.xml").write_text(
+        '<routes><vType id="human" laneChangeModel="SL2015" tau="0.8" speedDev="0"/>'
+        f'<route id="all" edges="{route}"/>{cars}</routes>'
+    )
+    path = folder / "crowd.toml"
+    text = SCENARIO.format(duration=seconds, last=n - 1, position=places[middle])
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+class Clock:
+    """Seconds spent in each part of the fleet's work, per step."""
+
+    def __init__(self) -> None:
+        self.steps: list[dict[str, float]] = []
+
+    def add(self, part: str, seconds: float) -> None:
+        self.steps[-1][part] += seconds
+
+    def timed(self, part: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        """Return the function, its wall time counted for a part."""
+
+        def call(*arguments: Any) -> Any:
+            start = perf_counter()
+            result = function(*arguments)
+            self.add(part, perf_counter() - start)
+            return result
+
+        return call
+
+
+@contextmanager
+def listening(clock: Clock) -> Iterator[None]:
+    """Count what the fleet, and nobody else, spends in each room."""
+    new_history, ask_planner = fleet_module.new_history, fleet_module.ask
+
+    def history(*arguments: Any) -> Any:
+        made = new_history(*arguments)
+        made.push = clock.timed("memory", made.push)
+        return made
+
+    def ask(*arguments: Any) -> Any:
+        start = perf_counter()
+        plan = ask_planner(*arguments)
+        whole = perf_counter() - start
+        clock.add("social", plan.social_time)
+        clock.add("solver", plan.wall_time)
+        clock.add("rest of the planner", whole - plan.social_time - plan.wall_time)
+        return plan
+
+    def drive(self: Fleet, scene: Any) -> Any:
+        clock.steps.append(defaultdict(float))
+        return whole(self, scene)
+
+    whole = Fleet.drive
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Overview, "along", staticmethod(clock.timed("projection", Overview.along)))
+        patch.setattr(Overview, "seen_by", clock.timed("perception", Overview.seen_by))
+        patch.setattr(fleet_module, "new_history", history)
+        patch.setattr(fleet_module, "ask", ask)
+        patch.setattr(Fleet, "drive", drive)
+        yield
+
+
+def crowd(planner: str, seconds: float, follow: bool) -> tuple[Rollout, pd.DataFrame]:
+    """One run: its rollout, and milliseconds per step and part."""
+    clock = Clock()
+    with tempfile.TemporaryDirectory() as folder, listening(clock):
+        setup = prepare(
+            write_crowd(Path(folder), seconds), planner, 0, {"cohesion.follow_egos": follow}
+        )
+        rollout = simulate(setup, make_planner(planner, setup.settings, setup.cohesion))
+    table = rollout.trajectory
+    others = table[table["planned"] & (table["vehicle"] != "ego")]
+    count = others.groupby("time").size().reindex(rollout.timing["time"], fill_value=0)
+    parts = 1e3 * pd.DataFrame([dict(step) for step in clock.steps]).fillna(0.0)
+    parts["everything (fleet_ms)"] = rollout.timing["fleet_ms"]
+    parts["SUMO's step and reading"] = rollout.timing["sumo_ms"]
+    return rollout, parts.assign(cars=count.to_numpy())
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--planner", default="cohesive")
+    parser.add_argument("--seconds", type=float, default=20.0)
+    parser.add_argument("--follow-egos", action="store_true", help="everybody remembers everybody")
+    given = parser.parse_args()
+    print("versions:", versions())
+    rollout, parts = crowd(given.planner, given.seconds, given.follow_egos)
+    full = parts[parts["cars"] >= AT_LEAST]
+    row = rollout.metrics.iloc[0]
+    print(
+        f"{given.planner} ({rollout.info['solver']}), {len(full)} of {len(parts)} steps with at "
+        f"least {AT_LEAST} planned cars, {full['cars'].median():.0f} in the median; run: "
+        f"{row['outcome']}, fleet_size {row['fleet_size']}, fleet_failures "
+        f"{row['fleet_failures']}, fleet_interventions {row['fleet_interventions']}, "
+        f"fleet_collisions {row['fleet_collisions']}"
+    )
+    print(f"most memory used: {getrusage(RUSAGE_SELF).ru_maxrss / 1024:.0f} MB")
+    print(f"{'ms per step':28} {'median':>8} {'p99':>8} {'median per car':>15}")
+    for name in parts.columns.drop("cars"):
+        each = (full[name] / full["cars"]).median()
+        print(f"{name:28} {full[name].median():8.1f} {full[name].quantile(0.99):8.1f} {each:15.3f}")
+
+
+if __name__ == "__main__":
+    main()
