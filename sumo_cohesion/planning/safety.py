@@ -49,13 +49,10 @@ def checked(plan: Plan, observation: Observation, road: Road, settings: PlannerS
     hardest = settings.friction * ego.speed - min(settings.max_braking, ego.speed / DT)
     curvature, acceleration, reasons = control.curvature, control.acceleration, []
     own = _extent(ego.heading, observation.ego_size)
-    states, sizes = observation.states.tolist(), observation.sizes.tolist()
-    stretches = (1.0 - observation.curvature * observation.states[:, 1]).tolist()
-    longest = 0.5 * sum(observation.ego_size)
-    for name, state, size, stretch in zip(observation.ids, states, sizes, stretches, strict=True):
-        s, d, heading, speed = state
-        if ego.s - s > longest + 0.5 * (size[0] + size[1]):
-            continue  # behind, however the two are turned
+    for i in _within_reach(observation, after[3], settings):
+        s, d, heading, speed = observation.states[i].tolist()
+        stretch = 1.0 - float(observation.curvature[i]) * d
+        size = observation.sizes[i].tolist()
         other = _extent(heading, size)
         along, across = speed * cos(heading), speed * sin(heading)
         ahead = s + DT * along / stretch - after[0] - own[0] - other[0]
@@ -64,13 +61,13 @@ def checked(plan: Plan, observation: Observation, road: Road, settings: PlannerS
         if behind and ahead < safe_distance(after[3], along, settings):
             if acceleration > hardest + 1e-9:
                 acceleration = hardest
-                reasons.append(f"too close behind {name}")
+                reasons.append(f"too close behind {observation.ids[i]}")
             continue
         if abs(s - ego.s) < own[0] + other[0] and aside < SIDE_MARGIN:
             straight = min(curvature, level) if d > ego.d else max(curvature, level)
             if straight != curvature:
                 curvature = straight
-                reasons.append(f"too close beside {name}")
+                reasons.append(f"too close beside {observation.ids[i]}")
     if not reasons:
         return plan
     safe = Control(curvature, acceleration)
@@ -82,6 +79,17 @@ def checked(plan: Plan, observation: Observation, road: Road, settings: PlannerS
         intervened=True,
         status=f"{plan.status}; last resort: {', '.join(reasons)}",
     )
+
+
+def _within_reach(observation: Observation, speed: float, settings: PlannerSettings) -> list[int]:
+    """Which cars the ego could be too close to after one step, at a speed (m/s): a few of many."""
+    ego, states = observation.ego, observation.states
+    # However they are turned, and wherever they are a step from now.
+    size = 0.5 * (sum(observation.ego_size) + observation.sizes.sum(axis=1))
+    size += 2.0 * DT * (speed + states[:, 3])
+    ahead, aside = states[:, 0] - ego.s, np.abs(states[:, 1] - ego.d)
+    near = (ahead > -size) & (ahead < size + safe_distance(speed, 0.0, settings))
+    return np.flatnonzero(near & (aside < size + SIDE_MARGIN)).tolist()
 
 
 def _extent(heading: float, size: Sequence[float]) -> tuple[float, float]:
