@@ -6,7 +6,7 @@ Pure geometry: it knows neither SUMO nor files. ``traffic.network`` builds it fr
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from math import floor, pi
+from math import floor, isfinite, pi
 from typing import NamedTuple
 
 import numpy as np
@@ -22,7 +22,8 @@ SPACING = 1.0
 class RoadAhead(NamedTuple):
     """The road at n places.
 
-    lanes, widths : (L, n) m; where a lane does not exist it is infinitely far and 1 m wide.
+    lanes, widths : (L, n) m; where a lane does not exist it is infinitely far and 1 m wide. Nor
+        does a lane off the route, as long as it has not parted from one of the route's.
     right, left : (n,) m, borders of the paved strip.
     speed_limit, curvature : (n,) m/s and 1/m.
     """
@@ -71,6 +72,7 @@ class Road:
     _segments: list[tuple[float, ...]] = field(init=False, repr=False, compare=False)
     _near: dict[tuple[int, int], int] = field(init=False, repr=False, compare=False)
     _centre_or_far: FloatArray = field(init=False, repr=False, compare=False)
+    _forked: FloatArray = field(init=False, repr=False, compare=False)
     _width_or_one: FloatArray = field(init=False, repr=False, compare=False)
     _bends: list[float] = field(init=False, repr=False, compare=False)
     _lane_rows: list[list[float]] = field(init=False, repr=False, compare=False)
@@ -89,6 +91,7 @@ class Road:
         # No lane is infinitely far: NaN would win every argmin.
         centre = np.where(np.isnan(self.lane_centre), np.inf, self.lane_centre)
         object.__setattr__(self, "_centre_or_far", centre)
+        object.__setattr__(self, "_forked", _forked(centre, self.lane_width, self.n_route_lanes))
         width = np.where(np.isnan(self.lane_width), 1.0, self.lane_width)
         object.__setattr__(self, "_width_or_one", width)
         object.__setattr__(self, "_bends", self.curvature.tolist())
@@ -145,12 +148,21 @@ class Road:
         right, left = self._strips[self.index(s), lane].T
         return right, left
 
-    def ahead(self, s: FloatArray, d: ArrayLike) -> RoadAhead:
-        """Look the road up at places s (m), (n,), on the strip that holds d (m), one or (n,)."""
+    def ahead(self, s: FloatArray, d: float) -> RoadAhead:
+        """Look the road up at places s (m), (n,), one after the other.
+
+        The strip is that of the lane that holds d (m) at the first place and goes on from there:
+        where an exit parts from the route, each has its own.
+        """
         i = self.index(s)
-        centres, widths = self._centre_or_far[i], self._width_or_one[i]
-        lane = np.abs(centres - np.asarray(d, float)[..., None]).argmin(axis=1)
-        right, left = self._strips[i, lane].T
+        centres, widths = self._forked[i], self._width_or_one[i]
+        followed = []
+        for row in centres.tolist():
+            off = [abs(centre - d) for centre in row]
+            lane = off.index(min(off))
+            d = row[lane] if isfinite(row[lane]) else d
+            followed.append(lane)
+        right, left = self._strips[i, followed].T
         return RoadAhead(centres.T, widths.T, right, left, self.speed_limit[i], self.curvature[i])
 
     def project(self, x: float, y: float) -> tuple[float, float, float, float]:
@@ -223,6 +235,19 @@ class Road:
             d /= tx * tx + ty * ty
             rows.append((x0 + u * ex - d * ty, y0 + u * ey + d * tx, heading + h0 + u * h1, speed))
         return np.array(rows, dtype=float).reshape(-1, 4)
+
+
+def _forked(centre: FloatArray, width: FloatArray, n_route_lanes: int) -> FloatArray:
+    """Centres without those of lanes off the route that still overlap one of the route's: (G, L).
+
+    Where a lane splits in two, both begin at the same place, and the way between them is neither.
+    """
+    route = centre[:, :n_route_lanes]
+    forked = centre.copy()
+    for lane in range(n_route_lanes, centre.shape[1]):
+        apart = np.abs(np.where(np.isinf(route), np.inf, route - centre[:, lane : lane + 1]))
+        forked[np.nanmin(apart, axis=1) < width[:, lane] / 2, lane] = np.inf
+    return forked
 
 
 def _strips(centre: FloatArray, width: FloatArray) -> FloatArray:

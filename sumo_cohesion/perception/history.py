@@ -29,7 +29,6 @@ class Track:
 
     Attributes
     ----------
-    voter : False for special vehicles, which nobody follows: no new transition is remembered.
     state : where the car was seen last.
     step : when it was seen last, in steps.
     steps, middle_s, middle_d, features, habits : of each remembered transition: the step it
@@ -48,11 +47,9 @@ class Track:
         "state",
         "step",
         "steps",
-        "voter",
     )
 
     def __init__(self, lag: int, habit: Habit) -> None:
-        self.voter = True
         self.step = -2
         self.state: State = (0.0, 0.0, 0.0, 0.0)
         self.steps: list[int] = []
@@ -170,7 +167,7 @@ class Path:
 
 
 class History:
-    """The transitions of all cars seen within the last ``memory`` seconds.
+    """The transitions of all voters seen within the last ``memory`` seconds.
 
     Parameters
     ----------
@@ -201,7 +198,7 @@ class History:
         self.ego_path = Path(self._memory)
 
     def push(self, observation: Observation) -> None:
-        """Remember one observation; call it once per step."""
+        """Remember one observation, of those to follow; call it once per step."""
         self._now += 1
         self._forget()
         self.ego_path.add(observation.ego.s, observation.ego.d)
@@ -214,14 +211,13 @@ class History:
             observation.voter,
             strict=True,
         ):
+            if not voter:
+                self._tracks.pop(name, None)  # it may have been one
+                continue
             track = self._tracks.get(name)
             if track is None:
                 track = self._tracks[name] = Track(self._lag, self._habit())
             in_sight.append(track)
-            track.voter = voter
-            if not voter:
-                track.step, track.state = self._now, state
-                continue
             track.see(
                 self._now,
                 state,
@@ -240,9 +236,9 @@ class History:
                 del self._tracks[name]
 
     def in_sight(self) -> Collection[Track]:
-        """Tracks of the cars in the latest observation."""
+        """Tracks of the voters in the latest observation."""
         return self._in_sight
 
     def all(self) -> Collection[Track]:
-        """Tracks of all remembered cars, in sight or not."""
+        """Tracks of all remembered voters, in sight or not."""
         return self._tracks.values()

@@ -21,7 +21,7 @@ from sumo_cohesion.planning.nlp import InteriorPoint
 from sumo_cohesion.planning.problem import Guess, Instance, Problem, Solution
 from sumo_cohesion.planning.settings import PlannerSettings
 from sumo_cohesion.planning.stage import CONTROL_SCALE, StageParameters, make_instance
-from sumo_cohesion.state import RESCUED, FloatArray
+from sumo_cohesion.state import RESCUED
 
 
 class Solver(Protocol):
@@ -74,11 +74,6 @@ class Mpc:
     def how(self) -> str:
         """Which solver, and whether it is compiled."""
         return f"{self.solver.name}, {self.solver.how}"
-
-    @property
-    def expected_lateral(self) -> FloatArray | None:
-        """Where across the road (m) the last solution is from now on, (T + 1,)."""
-        return None if self._warm is None else self._warm.states[:, 1]
 
     @property
     def rest(self) -> Guess | None:

@@ -130,9 +130,7 @@ class CohesivePlanner:
         horizon, ego = self.settings.horizon, observation.ego
         # Where the ego will be if it keeps its speed: the road is looked up there.
         s: FloatArray = ego.s + DT * ego.speed * np.arange(horizon + 1.0)
-        assert self._mpc is not None
-        expected = self._mpc.expected_lateral
-        ahead = self._road.ahead(s, ego.d if expected is None else expected)
+        ahead = self._road.ahead(s, ego.d)
         weight = np.zeros((len(FEATURES), horizon))
         target = np.zeros((len(FEATURES), horizon))
         if groups:

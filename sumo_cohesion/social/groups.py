@@ -38,11 +38,11 @@ def group_votes(ego: RoadState, history: History, road: Road, settings: Cohesion
     votes: Votes = {group: [] for group in GROUPS}
     for track in history.all():
         oncoming = abs(track.state[2]) > pi / 2  # nobody to follow
-        if track.voter and not oncoming and (vote := _vote_at_place(track, ego, settings)):
+        if not oncoming and (vote := _vote_at_place(track, ego, settings)):
             votes["position"].append(vote)
     own_lane = road.lane_of(ego.s, ego.d)
     for track in history.in_sight():
-        newest = track.newest() if track.voter else None
+        newest = track.newest()
         s, d, heading, _ = track.state
         if newest is None or abs(heading) > pi / 2:
             continue

@@ -92,7 +92,7 @@ def _companions(
     path = history.ego_path
     companions = []
     for track in history.all():
-        if not track.voter or not track.passed_by(ego.s):
+        if not track.passed_by(ego.s):
             continue
         s = max(ego.s - settings.place_look_back, path.first, track.middle_s[0])
         d = track.across(s)
