@@ -5,6 +5,7 @@ Pure geometry: it knows neither SUMO nor files. ``traffic.network`` builds it fr
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from math import floor, isfinite, pi
 from typing import NamedTuple
@@ -72,8 +73,7 @@ class Road:
     _segments: list[tuple[float, ...]] = field(init=False, repr=False, compare=False)
     _near: dict[tuple[int, int], int] = field(init=False, repr=False, compare=False)
     _centre_or_far: FloatArray = field(init=False, repr=False, compare=False)
-    _forked: FloatArray = field(init=False, repr=False, compare=False)
-    _width_or_one: FloatArray = field(init=False, repr=False, compare=False)
+    _ahead: FloatArray = field(init=False, repr=False, compare=False)
     _bends: list[float] = field(init=False, repr=False, compare=False)
     _lane_rows: list[list[float]] = field(init=False, repr=False, compare=False)
     _strips: FloatArray = field(init=False, repr=False, compare=False)
@@ -91,9 +91,11 @@ class Road:
         # No lane is infinitely far: NaN would win every argmin.
         centre = np.where(np.isnan(self.lane_centre), np.inf, self.lane_centre)
         object.__setattr__(self, "_centre_or_far", centre)
-        object.__setattr__(self, "_forked", _forked(centre, self.lane_width, self.n_route_lanes))
         width = np.where(np.isnan(self.lane_width), 1.0, self.lane_width)
-        object.__setattr__(self, "_width_or_one", width)
+        forked = _forked(centre, self.lane_width, self.n_route_lanes)
+        # Side by side, so that one look finds everything.
+        ahead = np.column_stack((forked, width, self.speed_limit, self.curvature))
+        object.__setattr__(self, "_ahead", ahead)
         object.__setattr__(self, "_bends", self.curvature.tolist())
         object.__setattr__(self, "_lane_rows", centre.tolist())
         object.__setattr__(self, "_strips", _strips(self.lane_centre, self.lane_width))
@@ -148,22 +150,24 @@ class Road:
         right, left = self._strips[self.index(s), lane].T
         return right, left
 
-    def ahead(self, s: FloatArray, d: float) -> RoadAhead:
-        """Look the road up at places s (m), (n,), one after the other.
+    def ahead(self, s: Sequence[float], d: float) -> RoadAhead:
+        """Look the road up at n places s (m), one after the other.
 
         The strip is that of the lane that holds d (m) at the first place and goes on from there:
         where an exit parts from the route, each has its own.
         """
-        i = self.index(s)
-        centres, widths = self._forked[i], self._width_or_one[i]
+        last, s0, n_lanes = self.x.size - 1, self.s0, self.lane_centre.shape[1]
+        i = [min(max(round((place - s0) / SPACING), 0), last) for place in s]
+        table = self._ahead[i].T
         followed = []
-        for row in centres.tolist():
+        for row in table[:n_lanes].T.tolist():
             off = [abs(centre - d) for centre in row]
             lane = off.index(min(off))
             d = row[lane] if isfinite(row[lane]) else d
             followed.append(lane)
         right, left = self._strips[i, followed].T
-        return RoadAhead(centres.T, widths.T, right, left, self.speed_limit[i], self.curvature[i])
+        limit, curvature = table[-2:]
+        return RoadAhead(table[:n_lanes], table[n_lanes:-2], right, left, limit, curvature)
 
     def project(self, x: float, y: float) -> tuple[float, float, float, float]:
         """Road coordinates of one Cartesian point.

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import math
-
 from sumo_cohesion.perception.history import History
 from sumo_cohesion.planning import dynamics
 from sumo_cohesion.planning.fallback import fallback
 from sumo_cohesion.planning.planners import Planner
 from sumo_cohesion.planning.settings import PlannerSettings
 from sumo_cohesion.road import Road
-from sumo_cohesion.state import CartesianState, Observation, Plan
+from sumo_cohesion.state import CartesianState, Control, Observation, Plan
 from sumo_cohesion.traffic.simulator import STEP_LENGTH
 
+SHARPEST, HARDEST = 1.0, 100.0
+"""Curvature (1/m) and acceleration (m/s²) beyond which a control is not that of a car."""
 END_OF_ROUTE = 20.0
 """Metres before the end of its route up to which a car is planned; SUMO would remove it there."""
 
@@ -27,13 +27,19 @@ def ask(
     """Ask the planner; whatever goes wrong in it, the car gets a plan and it is counted."""
     try:
         plan = planner.plan(observation, history)
-        usable = all(math.isfinite(v) for control in plan.controls[:1] for v in control)
-        status = "control is not finite"
+        usable = all(_is_physical(control) for control in plan.controls[:1])
+        status = "control is not finite, or not that of a car"
     except MemoryError:
         raise  # a car cannot drive on without memory; the run ends
     except Exception as error:
         usable, status = False, f"{type(error).__name__}: {error}"
     return plan if usable else fallback(observation, road, settings, status)
+
+
+def _is_physical(control: Control) -> bool:
+    """Tell whether any car could follow a control; no comparison with NaN is true."""
+    curvature, acceleration = control
+    return abs(curvature) <= SHARPEST and abs(acceleration) <= HARDEST
 
 
 def drive(state: CartesianState, plan: Plan, settings: PlannerSettings) -> CartesianState | None:

@@ -78,7 +78,7 @@ class Ilqr:
         self._p = f((t, self._parameters.size))
         self._low, self._high, self._most = f((t, 2)), f((t, 2)), f((t, 2))
         self._step, self._gain = f((t, 2)), f((t, N_STATES, 2))
-        self._mu, self._length = f(1), f(1)
+        self._mu, self._length, self._cost = f(1), f(1), f(1)
         self._change, self._convexity, self._terms = f(1), f(1), f(len(TERMS))
         bounds = [self._low, self._high, self._most]
         # A C-ordered (T, n) array is a CasADi matrix of T columns.
@@ -89,7 +89,7 @@ class Ilqr:
         self._run_forward = BoundCall(
             forward,
             [*given, self._step, self._gain, self._length],
-            [self._x_new, self._u_new, self._terms],
+            [self._x_new, self._u_new, self._cost, self._terms],
         )
 
     def solve(self, instance: Instance, guess: Guess) -> Solution:
@@ -153,7 +153,7 @@ class Ilqr:
     def _roll_out(self, length: float) -> float:
         self._length[0] = length
         self._run_forward()
-        return -float(self._terms.sum())
+        return float(self._cost[0])
 
     def _accept(self) -> None:
         self._x[:], self._u[:] = self._x_new, self._u_new
@@ -328,7 +328,7 @@ def _least_eigenvalue(h: Any) -> Any:
 
 
 def _forward_pass(stage: Stage, settings: PlannerSettings) -> Any:
-    """(x, u, p, low, high, most, steps, gains, length) -> (new x, new u, terms, summed)."""
+    """(x, u, p, low, high, most, steps, gains, length) -> (new x, new u, cost, terms)."""
     one = limited_stage(stage, settings)
     t, n = settings.horizon, N_STATES
     x, u, p, *bounds = _trajectory(stage, t)
@@ -344,5 +344,5 @@ def _forward_pass(stage: Stage, settings: PlannerSettings) -> Any:
     return ca.Function(
         "forward",
         [x, u, p, *bounds, steps, gains, length],
-        [ca.horzcat(*states), ca.horzcat(*controls), total],
+        [ca.horzcat(*states), ca.horzcat(*controls), -ca.sum1(total), total],
     )

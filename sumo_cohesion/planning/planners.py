@@ -129,8 +129,8 @@ class CohesivePlanner:
     ) -> Problem:
         horizon, ego = self.settings.horizon, observation.ego
         # Where the ego will be if it keeps its speed: the road is looked up there.
-        s: FloatArray = ego.s + DT * ego.speed * np.arange(horizon + 1.0)
-        ahead = self._road.ahead(s, ego.d)
+        pace = DT * ego.speed
+        ahead = self._road.ahead([ego.s + pace * t for t in range(horizon + 1)], ego.d)
         weight = np.zeros((len(FEATURES), horizon))
         target = np.zeros((len(FEATURES), horizon))
         if groups:
@@ -175,24 +175,27 @@ class CohesivePlanner:
 
     def _predict_cars(self, observation: Observation) -> FloatArray:
         """Predict the nearest cars at constant velocity: (6, N, T), see reward.StageInputs."""
-        horizon, n = self.settings.horizon, self.settings.cars
-        ego, m = observation.ego, min(len(observation.ids), n)
-        cars = np.empty((6, n, horizon))
+        n, (ego_s, ego_d, _, _) = self.settings.cars, observation.ego
+        cars = np.empty((6, n, self.settings.horizon))
+        states, m = observation.states.tolist(), min(len(observation.ids), n)
         cars[:, m:] = _NO_CAR
         if not m:
             return cars
-        offset = observation.states[:, :2] - (ego.s, ego.d)
-        nearest = np.argsort((offset * offset).sum(axis=1), kind="stable")[:n]
-        s, d, heading, speed = observation.states[nearest].T
-        length, width = observation.sizes[nearest].T
-        along, across = np.cos(heading), np.sin(heading)
-        pace = speed * along / (1.0 - observation.curvature[nearest] * d)
-        half_length = 0.5 * (length + observation.ego_size[0])
-        half_width = 0.5 * (width + observation.ego_size[1])
-        rows = np.array((s, d, along, across, half_length, half_width))
-        cars[:, :m] = rows[:, :, None]
-        cars[0, :m] += pace[:, None] * self._ahead
-        cars[1, :m] += (speed * across)[:, None] * self._ahead
+        # Numbers, not arrays, for so few.
+        distance = [(s - ego_s) ** 2 + (d - ego_d) ** 2 for s, d, _, _ in states]
+        nearest = sorted(range(len(states)), key=distance.__getitem__)[:n]
+        length, width = observation.ego_size
+        rows, velocities = [], []
+        for i in nearest:
+            s, d, heading, speed = states[i]
+            along, across = cos(heading), sin(heading)
+            other_length, other_width = observation.sizes[i].tolist()
+            half_sizes = 0.5 * (length + other_length), 0.5 * (width + other_width)
+            rows.append((s, d, along, across, *half_sizes))
+            stretch = 1.0 - float(observation.curvature[i]) * d
+            velocities.append((speed * along / stretch, speed * across))
+        cars[:, :m] = np.array(rows).T[:, :, None]
+        cars[:2, :m] += np.array(velocities).T[:, :, None] * self._ahead
         return cars
 
     def _to_plan(
