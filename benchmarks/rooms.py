@@ -9,6 +9,7 @@ stream of traffic and compares its first minute with its last.
 
 from __future__ import annotations
 
+import subprocess
 import tempfile
 from pathlib import Path
 from time import perf_counter
@@ -60,10 +61,8 @@ def timed_rollout(scenario: str | Path, seed: int, overrides: dict[str, Any]) ->
     return rollout.timing.assign(step_ms=steps[: len(rollout.timing)])
 
 
-def write_long_highway(folder: Path, minutes: float) -> Path:
-    """Write a straight highway in 1 km edges, long enough for the drive, with a stream on it."""
-    import subprocess
-
+def write_highway(folder: Path, minutes: float) -> int:
+    """Write a straight highway in 1 km edges, long enough for the drive; returns its last edge."""
     n = int(minutes * 60 * 30 / 1000) + 3
     nodes = "".join(f'<node id="n{i}" x="{1000 * i}" y="0"/>' for i in range(n + 1))
     edges = "".join(
@@ -72,24 +71,15 @@ def write_long_highway(folder: Path, minutes: float) -> Path:
     )
     (folder / "long.nod.xml").write_text(f"<nodes>{nodes}</nodes>")
     (folder / "long.edg.xml").write_text(f"<edges>{edges}</edges>")
-    subprocess.run(
-        [
-            "netconvert",
-            "-n",
-            "long.nod.xml",
-            "-e",
-            "long.edg.xml",
-            "-o",
-            "long.net.xml",
-            "--offset.disable-normalization",
-            "true",
-            "--no-turnarounds",
-            "true",
-        ],
-        cwd=folder,
-        check=True,
-        capture_output=True,
-    )
+    files = ["-n", "long.nod.xml", "-e", "long.edg.xml", "-o", "long.net.xml"]
+    options = ["--offset.disable-normalization", "true", "--no-turnarounds", "true"]
+    subprocess.run(["netconvert", *files, *options], cwd=folder, check=True, capture_output=True)
+    return n - 1
+
+
+def write_long_highway(folder: Path, minutes: float) -> Path:
+    """Write such a highway with a stream on it."""
+    n = write_highway(folder, minutes) + 1
     route = " ".join(f"e{i}" for i in range(n))
     flows = "".join(
         f'<flow id="f{lane}" type="human" route="all" begin="0" end="40" period="2.5" '

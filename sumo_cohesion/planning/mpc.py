@@ -132,7 +132,7 @@ class Mpc:
         if not isfinite(states.sum() + controls.sum()):
             return False
         scaled = controls / CONTROL_SCALE
-        if (scaled < instance.low - _HAIR).any() or (scaled > instance.high + _HAIR).any():
+        if (np.minimum(scaled - instance.low, instance.high - scaled) < -_HAIR).any():
             return False
         start, bend = problem.ego.tolist(), float(problem.road_curvature[0])
         reached = dynamics.step(start, controls[0].tolist(), DT, friction, bend)

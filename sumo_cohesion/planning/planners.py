@@ -75,6 +75,7 @@ class CohesivePlanner:
         self._election = Election(cohesion)
         self._mpc: Mpc | None = None
         self._driven: Control | None = None
+        self._nothing = np.zeros((len(FEATURES), settings.horizon))
         self._ahead = DT * np.arange(1, settings.horizon + 1)
         # Where the horizon is asked for the others' place: every third step is dense enough.
         self._place_steps = list(range(1, settings.horizon + 1, 3))
@@ -131,17 +132,20 @@ class CohesivePlanner:
         # Where the ego will be if it keeps its speed: the road is looked up there.
         pace = DT * ego.speed
         ahead = self._road.ahead([ego.s + pace * t for t in range(horizon + 1)], ego.d)
-        weight = np.zeros((len(FEATURES), horizon))
-        target = np.zeros((len(FEATURES), horizon))
+        weight, target, pressure = self._nothing, self._nothing, 0.0
         if groups:
             # The paper's cohesion is on the first transition.
-            stages = slice(1 if self.cohesion.transitions == "first" else None)
+            n = 1 if self.cohesion.transitions == "first" else horizon
             term = combine(groups)
-            weight[:, stages] = self.cohesion.beta * np.array(term.weight)[:, None]
-            target[:, stages] = np.array(term.target)[:, None]
-        place_weight, place_target = self._place(place)
-        # The more, the more cohesion could win by coming too close.
-        pressure = float(weight.sum() + place_weight.sum() * PLACE_SCALE**2)
+            rows = np.array((term.weight, term.target))[:, :, None]
+            rows[0] *= self.cohesion.beta
+            weight, target = self._nothing.copy(), self._nothing.copy()
+            weight[:, :n], target[:, :n] = rows
+            pressure = n * self.cohesion.beta * sum(term.weight)
+        place_weight, place_target = self._nothing[0], self._nothing[0]
+        if any(place.weight):
+            place_weight, place_target = self._place(place)
+            pressure += float(place_weight.sum()) * PLACE_SCALE**2
         return Problem(
             ego=np.array(ego),
             ego_width=np.array([observation.ego_size[1]]),
@@ -157,16 +161,14 @@ class CohesivePlanner:
             cohesion_target=target,
             place_weight=place_weight,
             place_target=place_target,
+            # The more, the more cohesion could win by coming too close.
             constraint_weight=np.array([self.settings.constraint * (1.0 + pressure)]),
             driven=self._driven,
         )
 
     def _place(self, place: Place) -> tuple[FloatArray, FloatArray]:
         """Weights and targets of the place across the road, for every stage."""
-        horizon = self.settings.horizon
-        if not any(place.weight):
-            return np.zeros(horizon), np.zeros(horizon)
-        stages = np.arange(1, horizon + 1)
+        stages = np.arange(1, self.settings.horizon + 1)
         steps, asked = np.array(self._place_steps), np.array(place.weight)
         known = asked > 0.0
         weight = np.interp(stages, steps, asked) * (self.cohesion.beta / PLACE_SCALE**2)

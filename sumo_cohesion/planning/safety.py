@@ -49,10 +49,16 @@ def checked(plan: Plan, observation: Observation, road: Road, settings: PlannerS
     hardest = settings.friction * ego.speed - min(settings.max_braking, ego.speed / DT)
     curvature, acceleration, reasons = control.curvature, control.acceleration, []
     own = _extent(ego.heading, observation.ego_size)
-    for i in _within_reach(observation, after[3], settings):
-        s, d, heading, speed = observation.states[i].tolist()
+    length, width = observation.ego_size
+    reach = safe_distance(after[3], 0.0, settings)
+    sizes = observation.sizes.tolist()
+    for i, (s, d, heading, speed) in enumerate(observation.states.tolist()):
+        size = sizes[i]
+        # Far away however they are turned, and wherever they are a step from now: most are.
+        near = 0.5 * (length + width + size[0] + size[1]) + 2.0 * DT * (after[3] + speed)
+        if not -near < s - ego.s < near + reach or abs(d - ego.d) > near + SIDE_MARGIN:
+            continue
         stretch = 1.0 - float(observation.curvature[i]) * d
-        size = observation.sizes[i].tolist()
         other = _extent(heading, size)
         along, across = speed * cos(heading), speed * sin(heading)
         ahead = s + DT * along / stretch - after[0] - own[0] - other[0]
@@ -79,17 +85,6 @@ def checked(plan: Plan, observation: Observation, road: Road, settings: PlannerS
         intervened=True,
         status=f"{plan.status}; last resort: {', '.join(reasons)}",
     )
-
-
-def _within_reach(observation: Observation, speed: float, settings: PlannerSettings) -> list[int]:
-    """Which cars the ego could be too close to after one step, at a speed (m/s): a few of many."""
-    ego, states = observation.ego, observation.states
-    # However they are turned, and wherever they are a step from now.
-    size = 0.5 * (sum(observation.ego_size) + observation.sizes.sum(axis=1))
-    size += 2.0 * DT * (speed + states[:, 3])
-    ahead, aside = states[:, 0] - ego.s, np.abs(states[:, 1] - ego.d)
-    near = (ahead > -size) & (ahead < size + safe_distance(speed, 0.0, settings))
-    return np.flatnonzero(near & (aside < size + SIDE_MARGIN)).tolist()
 
 
 def _extent(heading: float, size: Sequence[float]) -> tuple[float, float]:

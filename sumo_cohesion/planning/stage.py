@@ -6,6 +6,7 @@ A stage goes from one state to the next. Its reward is the ego's own, at the sta
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import casadi as ca
@@ -166,18 +167,22 @@ def make_stage(settings: PlannerSettings, parameters: StageParameters) -> Stage:
 def make_instance(problem: Problem, stages: FloatArray, settings: PlannerSettings) -> Instance:
     """Put a problem into the solvers' numbers; ``stages`` are its filled parameters."""
     low, high = control_bounds(settings, float(problem.ego[3]))
-    change = np.empty((settings.horizon, 2))
-    change[:, 0] = DT * settings.max_curvature_rate / SCALES[0]
-    change[:, 1] = DT * settings.max_jerk / SCALES[1]
-    start = np.zeros(N_STATES)
+    start, change = np.zeros(N_STATES), _largest_change(settings)
     start[:4] = problem.ego
     if problem.driven is None:
+        change = change.copy()
         change[0] = UNLIMITED
-    else:
-        # What was driven under other bounds, at another speed, must not leave nothing to choose.
-        driven = [value / scale for value, scale in zip(problem.driven, SCALES, strict=True)]
-        start[4:] = np.minimum(np.maximum(driven, low[0]), high[0])
+        return Instance(start, stages, low, high, change)
+    # What was driven under other bounds, at another speed, must not leave nothing to choose.
+    bounds = zip(problem.driven, SCALES, low[0].tolist(), high[0].tolist(), strict=True)
+    start[4:] = [min(max(value / scale, least), most) for value, scale, least, most in bounds]
     return Instance(start, stages, low, high, change)
+
+
+@lru_cache(maxsize=32)
+def _largest_change(settings: PlannerSettings) -> FloatArray:
+    per_step = (DT * settings.max_curvature_rate / SCALES[0], DT * settings.max_jerk / SCALES[1])
+    return np.tile(per_step, (settings.horizon, 1))
 
 
 def control_bounds(settings: PlannerSettings, speed: float) -> tuple[FloatArray, FloatArray]:
@@ -187,11 +192,16 @@ def control_bounds(settings: PlannerSettings, speed: float) -> tuple[FloatArray,
     is bounded so that the lateral acceleration keeps to its bound however fast the ego may be by
     then.
     """
-    gain = DT * settings.max_acceleration
-    bends = [settings.sharpest(speed + gain * t) / SCALES[0] for t in range(settings.horizon)]
-    drag = settings.friction * speed
-    low, high = np.empty((settings.horizon, 2)), np.empty((settings.horizon, 2))
-    high[:, 0] = bends
+    gain, drag, horizon = (
+        DT * settings.max_acceleration,
+        settings.friction * speed,
+        settings.horizon,
+    )
+    low, high = np.empty((horizon, 2)), np.empty((horizon, 2))
+    if settings.sharpest(speed + gain * horizon) == settings.max_curvature:
+        high[:, 0] = settings.max_curvature / SCALES[0]
+    else:
+        high[:, 0] = [settings.sharpest(speed + gain * t) / SCALES[0] for t in range(horizon)]
     low[:, 0] = -high[:, 0]
     low[:, 1] = (drag - settings.max_braking) / SCALES[1]
     high[:, 1] = (drag + settings.max_acceleration) / SCALES[1]

@@ -1,0 +1,120 @@
+"""A closed-loop step's rooms, and what the cohesive ego adds to a scenario of 50 human cars.
+
+    python -m benchmarks.loop [--seeds 6] [--seconds 60]
+
+The same traffic three times per seed, in turns: bare SUMO (libsumo's steps and nothing else), the
+closed loop with SUMO driving the ego, and with the cohesive planner. Medians over the seeds of
+CPU time: whole runs (start, loop, tables), and milliseconds per step of every room.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+import time
+from pathlib import Path
+
+import pandas as pd
+
+from benchmarks.rooms import SCENARIO, write_highway
+from sumo_cohesion.experiments.rollout import Rollout, versions
+from sumo_cohesion.experiments.setup import prepare
+from sumo_cohesion.experiments.simulation import simulate
+from sumo_cohesion.planning.planners import make_planner
+from sumo_cohesion.traffic.library import load_libsumo
+
+HUMANS, EGO_PLACE = 50, 25
+
+
+def write_platoon(folder: Path, seconds: float) -> Path:
+    """Write a highway and 50 humans on three lanes, the ego in their middle."""
+    last = write_highway(folder, seconds / 60)
+    cars = "".join(
+        f'<vehicle id="h{i}" type="human" route="all" depart="0" departLane="{i % 3}" '
+        f'departPos="{20 + 30 * (i // 3) + 10 * (i % 3)}" departSpeed="desired"/>'
+        for i in range(HUMANS + 1)
+        if i != EGO_PLACE
+    )
+    route = " ".join(f"e{i}" for i in range(last + 1))
+    (folder / "stream.rou.xml").write_text(
+        '<routes><vType id="human" laneChangeModel="SL2015" speedDev="0.02"/>'
+        f'<route id="all" edges="{route}"/>{cars}</routes>'
+    )
+    path = folder / "platoon.toml"
+    text = SCENARIO.format(duration=seconds, last=last).replace("depart = 30.0", "depart = 0.0")
+    path.write_text(text.replace("position = 100.0", f"position = {30 + 10 * EGO_PLACE}"))
+    return path
+
+
+def bare(path: Path, seed: int, steps: int) -> float:
+    """CPU seconds of SUMO alone: the same start and as many steps."""
+    setup = prepare(path, "sumo", seed)
+    with tempfile.TemporaryDirectory() as folder:
+        start = time.process_time()
+        sumo = load_libsumo()
+        sumo.start(["sumo", *setup.write_inputs(Path(folder)).options()])
+        for _ in range(steps):
+            sumo.simulationStep()
+        sumo.close()
+        return time.process_time() - start
+
+
+def looped(path: Path, planner: str, seed: int) -> tuple[float, Rollout]:
+    """CPU seconds of a run in the closed loop, its planner ready."""
+    setup = prepare(path, planner, seed)
+    driver = make_planner(planner, setup.settings, setup.cohesion)
+    driver.reset(setup.road)
+    start = time.process_time()
+    rollout = simulate(setup, driver)
+    return time.process_time() - start, rollout
+
+
+def rooms(rollout: Rollout) -> dict[str, float]:
+    """Milliseconds per step, medians."""
+    t = rollout.timing
+    planner = t["plan_ms"] - t["social_ms"] - t["solver_ms"]
+    return {
+        "perception": t["perception_ms"].median(),
+        "social": t["social_ms"].median(),
+        "solver": t["solver_ms"].median(),
+        "rest of the planner": planner.median(),
+        "SUMO: move, step, read": t["sumo_ms"].median(),
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--seeds", type=int, default=6)
+    parser.add_argument("--seconds", type=float, default=60.0)
+    given = parser.parse_args()
+    print("versions:", versions())
+    rows, shares = [], {"sumo": [], "cohesive": []}
+    with tempfile.TemporaryDirectory() as folder:
+        path = write_platoon(Path(folder), given.seconds)
+        for seed in range(-1, given.seeds):
+            spent = {}
+            for planner in ("sumo", "cohesive"):
+                spent[planner], rollout = looped(path, planner, max(seed, 0))
+                if seed >= 0:
+                    shares[planner].append(rooms(rollout))
+            steps = round(rollout.trajectory["time"].iloc[-1] / 0.1)
+            spent["bare SUMO"] = bare(path, max(seed, 0), steps)
+            if seed >= 0:  # the first round warms up
+                rows.append(spent)
+    runs = pd.DataFrame(rows)
+    print(f"{HUMANS} human cars, {len(runs)} seeds, {given.seconds:g} s; CPU s per run, medians:")
+    print(runs.median().round(2).to_string())
+    added = runs["cohesive"] / runs["sumo"] - 1.0
+    print(f"the cohesive ego adds {100 * added.median():.0f} % to SUMO driving the ego in the loop")
+    print(f"  of each seed: {', '.join(f'{100 * a:.0f}' for a in added)}")
+    ours = runs["cohesive"] / runs["bare SUMO"]
+    print(f"the loop with the cohesive ego takes {ours.median():.2f} x bare SUMO")
+    print("\nms per step")
+    table = pd.DataFrame({name: pd.DataFrame(rows).median() for name, rows in shares.items()})
+    for name in ("sumo", "cohesive"):
+        table[f"share, {name}"] = table[name] / table[name].sum()
+    print(table.round(3).to_string())
+
+
+if __name__ == "__main__":
+    main()
