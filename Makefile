@@ -5,7 +5,7 @@ NETCONVERT := $(BIN)/netconvert --offset.disable-normalization true --no-turnaro
 # Threads of the linear algebra library only cost time here: the matrices are tiny.
 export OPENBLAS_NUM_THREADS := 1
 
-.PHONY: demo test lint check faults format networks docs lock wheel benchmark benchmark-planner reproduce ablation figures example clean
+.PHONY: demo test lint check faults format networks docs lock wheel benchmark benchmark-planner reproduce ablation horizon figures example clean
 
 demo: $(VENV)/.installed
 	$(BIN)/sumo-cohesion compare stalled --seeds 0:8 --out demo
@@ -59,6 +59,11 @@ ablation: $(VENV)/.installed
 	$(BIN)/python -m analysis.ablation
 	$(BIN)/python -m analysis.markdown
 
+# How far ahead to plan, and on which transitions to be cohesive: ten minutes.
+horizon: $(VENV)/.installed
+	$(BIN)/python -m analysis.horizon
+	$(BIN)/python -m analysis.markdown
+
 figures: $(VENV)/.installed
 	$(BIN)/python analysis/figures.py
 
@@ -72,6 +77,7 @@ benchmark-planner: $(VENV)/.installed
 
 benchmark: $(VENV)/.installed
 	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python benchmarks/rooms.py | tee benchmarks/rooms.txt
+	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -m benchmarks.loop | tee benchmarks/loop.txt
 	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -u -m benchmarks.batch | tee benchmarks/batch.txt
 	PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -m benchmarks.fleet | tee benchmarks/fleet.txt
 

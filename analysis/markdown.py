@@ -1,4 +1,4 @@
-"""The tables of docs/evidence.md, made of analysis/*.csv.
+"""The tables of docs/evidence.md and docs/planner.md, made of analysis/*.csv and benchmarks/*.csv.
 
     python -m analysis.markdown
 
@@ -13,7 +13,9 @@ from pathlib import Path
 import pandas as pd
 
 HERE = Path(__file__).resolve().parent
-EVIDENCE = HERE.parent / "docs" / "evidence.md"
+DOCS = HERE.parent / "docs"
+EVIDENCE, PLANNER = DOCS / "evidence.md", DOCS / "planner.md"
+BENCHMARKS = HERE.parent / "benchmarks"
 CONTACT = "touches a car that it can see"
 PLANNERS = ("nominal", "cohesive", "paper", "sumo")
 
@@ -54,21 +56,71 @@ def ablation_table(ablation: pd.DataFrame) -> str:
     return "\n".join(lines)
 
 
-def with_tables(text: str) -> str:
-    """Return the document with its tables renewed."""
-    tables = {
-        "claims": claims_table(pd.read_csv(HERE / "claims.csv")),
-        "ablation": ablation_table(pd.read_csv(HERE / "ablation.csv")),
+def horizon_table(horizon: pd.DataFrame) -> str:
+    """One row per horizon and place of cohesion: successes, and what it costs."""
+    # Success in `exit` is to stay; what the paper expects of the cohesive car is to be tricked.
+    counted = horizon.assign(
+        count=horizon["success"].where(horizon["scenario"] != "exit", horizon["exited"])
+    )
+    scenarios = list(dict.fromkeys(horizon["scenario"]))
+    names = ["`exit` (tricked)" if s == "exit" else f"`{s}`" for s in scenarios]
+    names += ["off the road", "interventions", "ms per plan"]
+    lines = ["| planned, cohesive on | " + " | ".join(names) + " |", "|---|" + "---|" * len(names)]
+    for change, rows in counted.groupby("changed", sort=False):
+        by_scenario = rows.set_index("scenario")["count"]
+        cells = [str(by_scenario[s]) for s in scenarios]
+        cells += [str(rows["off_road"].sum()), str(rows["interventions"].sum())]
+        cells.append(f"{rows['median_plan_ms'].median():.1f}")
+        lines.append(f"| {change} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def solvers_table(planner: pd.DataFrame, horizon: int) -> str:
+    """One row per method: times of cold and warm solves, beside ours."""
+    rows = planner[planner["horizon"] == horizon].set_index(["start", "method"])
+    warm, cold = rows.loc["warm"], rows.loc["cold"]
+    lines = [
+        "| method | warm, ms | 99 % | cold, ms | 99 % | times ours (warm) | gap | failed |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for name in warm["median_ms"].sort_values().index:
+        w, c = warm.loc[name], cold.loc[name]
+        numbers = [w["median_ms"], w["p99_ms"], c["median_ms"], c["p99_ms"]]
+        cells = [f"{v:.2f}" for v in numbers] + [f"{w['times_ours']:.1f}"]
+        cells += [f"{int(w[k] + c[k])} of {int(w['n'] + c['n'])}" for k in ("gap", "failed")]
+        lines.append(f"| {name} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def pages() -> dict[Path, dict[str, str]]:
+    """Tables of each page, by name."""
+    solvers = pd.read_csv(BENCHMARKS / "planner.csv")
+    return {
+        EVIDENCE: {
+            "claims": claims_table(pd.read_csv(HERE / "claims.csv")),
+            "ablation": ablation_table(pd.read_csv(HERE / "ablation.csv")),
+        },
+        PLANNER: {
+            "horizon": horizon_table(pd.read_csv(HERE / "horizon.csv")),
+            "solvers 10": solvers_table(solvers, 10),
+            "solvers 40": solvers_table(solvers, 40),
+        },
     }
+
+
+def with_tables(page: Path, tables: dict[str, str]) -> str:
+    """Return the page with its tables renewed."""
+    text = page.read_text(encoding="utf-8")
     for name, table in tables.items():
         pattern = rf"(<!-- {name} -->\n).*?(\n<!-- end -->)"
         text, found = re.subn(
             pattern, lambda m, new=table: m[1] + new + m[2], text, flags=re.DOTALL
         )
         if found != 1:
-            raise SystemExit(f"{EVIDENCE}: no place for the table {name!r}")
+            raise SystemExit(f"{page}: no place for the table {name!r}")
     return text
 
 
 if __name__ == "__main__":
-    EVIDENCE.write_text(with_tables(EVIDENCE.read_text(encoding="utf-8")), encoding="utf-8")
+    for page, tables in pages().items():
+        page.write_text(with_tables(page, tables), encoding="utf-8")

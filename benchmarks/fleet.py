@@ -30,7 +30,11 @@ from sumo_cohesion.experiments.rollout import Rollout, versions
 from sumo_cohesion.experiments.setup import prepare
 from sumo_cohesion.experiments.simulation import simulate
 from sumo_cohesion.perception.observation import Overview
+from sumo_cohesion.planning.compiled import BoundCall, compiled
+from sumo_cohesion.planning.ilqr import _backward_pass
 from sumo_cohesion.planning.planners import make_planner
+from sumo_cohesion.planning.settings import PlannerSettings
+from sumo_cohesion.planning.stage import StageParameters, make_stage
 
 LANES, SPACING, AT_LEAST = 5, 16.0, 100
 SCENARIO = """
@@ -160,6 +164,30 @@ def crowd(planner: str, seconds: float, follow: bool) -> tuple[Rollout, pd.DataF
     return rollout, parts.assign(cars=count.to_numpy())
 
 
+def one_call(n: int) -> dict[str, float]:
+    """Milliseconds of a derivative pass for n problems: n calls, and one of CasADi's map(n)."""
+    settings = PlannerSettings()
+    one = _backward_pass(
+        make_stage(settings, StageParameters(settings, LANES)), settings, exact=True
+    )
+    functions = {"loop": (one, n), "map": (one.map(n), 1)}
+    fast, _ = compiled([one, one.map(n)])
+    functions |= {"loop, compiled": (fast[0], n), "map, compiled": (fast[1], 1)}
+    found = {}
+    for name, (function, calls) in functions.items():
+        rng = np.random.default_rng(0)
+        given = [rng.uniform(0.1, 1.0, function.numel_in(i)) for i in range(function.n_in())]
+        out = [np.zeros(function.numel_out(i)) for i in range(function.n_out())]
+        run, times = BoundCall(function, given, out), []
+        for _ in range(15):
+            start = perf_counter()
+            for _ in range(calls):
+                run()
+            times.append(1e3 * (perf_counter() - start))
+        found[name] = float(np.median(times))
+    return found
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--planner", default="cohesive")
@@ -178,6 +206,8 @@ def main() -> None:
         f"fleet_collisions {row['fleet_collisions']}"
     )
     print(f"most memory used: {getrusage(RUSAGE_SELF).ru_maxrss / 1024:.0f} MB")
+    passes = ", ".join(f"{name} {ms:.1f}" for name, ms in one_call(AT_LEAST).items())
+    print(f"derivatives of {AT_LEAST} problems, ms: {passes}")
     print(f"{'ms per step':28} {'median':>8} {'p99':>8} {'median per car':>15}")
     for name in parts.columns.drop("cars"):
         each = (full[name] / full["cars"]).median()

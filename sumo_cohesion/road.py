@@ -246,11 +246,11 @@ def _forked(centre: FloatArray, width: FloatArray, n_route_lanes: int) -> FloatA
 
     Where a lane splits in two, both begin at the same place, and the way between them is neither.
     """
-    route = centre[:, :n_route_lanes]
+    route = np.where(np.isinf(centre[:, :n_route_lanes]), 1e9, centre[:, :n_route_lanes])
     forked = centre.copy()
     for lane in range(n_route_lanes, centre.shape[1]):
-        apart = np.abs(np.where(np.isinf(route), np.inf, route - centre[:, lane : lane + 1]))
-        forked[np.nanmin(apart, axis=1) < width[:, lane] / 2, lane] = np.inf
+        nearest = np.abs(route - centre[:, lane : lane + 1]).min(axis=1)
+        forked[nearest < width[:, lane] / 2, lane] = np.inf
     return forked
 
 

@@ -122,3 +122,24 @@ def test_routes_that_do_not_exist_say_so() -> None:
         network.route("ramp", "bend_2")
     with pytest.raises(UserError, match=r"has no edge 'nowhere'; its edges are bend_1"):
         network.route("straight", "nowhere")
+
+
+@pytest.mark.parametrize("way", ["ramp", "after"])
+def test_ahead_keeps_to_the_routes_own_branch_where_a_lane_splits(way: str) -> None:
+    """Ramp and through lane begin as one, half a metre apart at first and seven at the end."""
+    road = Network(ROOT / "networks" / "exit.net.xml").road(("before", way))
+    places = np.arange(1000.0, 1100.0, 5.0)
+    right_lane = float(np.nanmin(road.lanes_at(900.0)))
+    ahead = road.ahead(places.tolist(), right_lane)
+    route = road.lanes_at(places)[:, : road.n_route_lanes]
+    own = route[np.arange(len(places)), np.nanargmin(np.abs(route - right_lane), axis=1)]
+    assert np.abs(own - right_lane).max() < 0.3
+    # The edges are those of its own branch, and leave room for it.
+    assert (ahead.right < own - 1.7).all()
+    assert (ahead.left > own + 1.7).all()
+    at_end = ahead.left[-1] - ahead.right[-1]
+    assert at_end == pytest.approx(3.5 if way == "ramp" else 10.5, abs=0.1)
+    # Between the two there is no lane: the other counts from half a lane's width on.
+    off = np.abs(ahead.lanes[road.n_route_lanes :] - own)
+    assert off.min() >= 1.7
+    assert np.isfinite(ahead.lanes[road.n_route_lanes :]).any()
