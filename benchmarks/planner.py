@@ -311,7 +311,7 @@ def compare(horizon: int, n: int) -> pd.DataFrame:
                 plan = Solution(
                     _states(host, problem, controls), controls * CONTROL_SCALE, True, "", 0, 0.0, {}
                 )
-                warm[name] = host._shifted(plan)
+                warm[name] = host._shifted(plan, float(problem.road_curvature[-1]))
     columns = ["method", "start", "instance", "ms", "first_ms", "reward", "nothing", "solved"]
     table = pd.DataFrame(rows, columns=columns)
     table["best"] = table.groupby("instance")["reward"].transform("max")

@@ -148,7 +148,7 @@ class Plan:
     states : (T + 1, 4) predicted road states, the present one first.
     status : "solved", RESCUED, "sumo", or why the plan is a fallback.
     solver : which one, and whether it is compiled; empty for planners without.
-    fallback : True if the solver gave nothing usable and the ego brakes in its lane.
+    fallback : True if there was no usable plan: the rest of the last one, or braking in lane.
     intervened : True if the last resort (planning.safety) changed the first control.
     iterations : solver iterations.
     wall_time, social_time : seconds spent in the solver, and on who, what and when (the runner

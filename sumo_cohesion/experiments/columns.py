@@ -36,7 +36,9 @@ TRAJECTORY = (
 PLAN = (
     Column("time", "float64", "s", "SUMO time at which the plan was made"),
     Column("status", "string", "", "solved, rescued by ipopt, sumo, or why the plan is a fallback"),
-    Column("fallback", "bool", "", "the ego braked in lane because there was no usable plan"),
+    Column(
+        "fallback", "bool", "", "no usable plan: the last one went on, or the ego braked in lane"
+    ),
     Column("intervened", "bool", "", "the last resort changed the control; the status says why"),
     Column("iterations", "int64", "", "solver iterations"),
     Column("curvature", "float64", "1/m", "driven control; NaN if SUMO drives"),

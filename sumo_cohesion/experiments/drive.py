@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from sumo_cohesion.perception.history import History
 from sumo_cohesion.planning import dynamics
 from sumo_cohesion.planning.fallback import fallback
@@ -27,6 +29,9 @@ def ask(
     """Ask the planner; whatever goes wrong in it, the car gets a plan and it is counted."""
     try:
         plan = planner.plan(observation, history)
+        if not all(isinstance(control, Control) for control in plan.controls):
+            controls = tuple(Control(float(c), float(a)) for c, a in plan.controls)
+            plan = replace(plan, controls=controls)
         usable = all(_is_physical(control) for control in plan.controls[:1])
         status = "control is not finite, or not that of a car"
     except MemoryError:
@@ -46,5 +51,9 @@ def drive(state: CartesianState, plan: Plan, settings: PlannerSettings) -> Carte
     """Where the first planned control takes a car; None if SUMO drives it."""
     if not plan.controls:
         return None
-    x, y, heading, speed = dynamics.step(state, plan.controls[0], STEP_LENGTH, settings.friction)
+    curvature, acceleration = plan.controls[0]
+    # No car reverses, whatever a planner wants.
+    stop = settings.friction * state.speed - state.speed / STEP_LENGTH
+    control = Control(curvature, max(acceleration, stop))
+    x, y, heading, speed = dynamics.step(state, control, STEP_LENGTH, settings.friction)
     return CartesianState(float(x), float(y), float(heading), max(float(speed), 0.0))

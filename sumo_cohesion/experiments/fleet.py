@@ -182,19 +182,19 @@ class Fleet:
             return
         if register.has_stop(name):
             return
+        planner = make_planner(setup.planner_name, setup.settings, setup.cohesion)
         try:
             road = setup.road_along(register.route(name))
+            planner.reset(road)
         except MemoryError:
             raise
-        except Exception as error:  # whatever a network has that no car can drive along
+        except Exception as error:  # whatever a network has that this planner cannot drive along
             self._without_road[name] = str(error)
             self._human.add(name)
             return
         if _at_end(road, state):
             self._human.add(name)
             return
-        planner = make_planner(setup.planner_name, setup.settings, setup.cohesion)
-        planner.reset(road)
         history = new_history(setup.cohesion, STEP_LENGTH, self._features)
         self._members[name] = _Member(road, planner, history)
         self._were_planned.add(name)

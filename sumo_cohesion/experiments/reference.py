@@ -18,7 +18,7 @@ import numpy as np
 from sumo_cohesion.perception.history import History
 from sumo_cohesion.perception.observation import Sensor
 from sumo_cohesion.planning import dynamics
-from sumo_cohesion.planning.planners import make_planner
+from sumo_cohesion.planning.planners import CohesivePlanner, cohesion_of
 from sumo_cohesion.state import CartesianState, Observation, Plan, Scene
 
 if TYPE_CHECKING:
@@ -31,8 +31,9 @@ class Reference:
     def __init__(self, setup: Setup, sensor: Sensor) -> None:
         self._sensor = sensor
         self._friction = setup.settings.friction
-        self._from_here = make_planner("nominal", setup.settings, setup.cohesion)
-        self._of_twin = make_planner("nominal", setup.settings, setup.cohesion)
+        nominal = cohesion_of("nominal", setup.cohesion)
+        self._from_here = CohesivePlanner(setup.settings, nominal)
+        self._of_twin = CohesivePlanner(setup.settings, nominal)
         self._from_here.reset(setup.road)
         self._of_twin.reset(setup.road)
         self._twin: CartesianState | None = None
@@ -42,6 +43,7 @@ class Reference:
     def add(self, scene: Scene, observation: Observation, history: History, plan: Plan) -> None:
         """Compare one step's plan with the nominal one, and drive the twin one step."""
         nominal = self._from_here.plan(observation, history)
+        self._from_here.continue_from(plan.controls[0] if plan.controls else None)
         if len(plan.states) == len(nominal.states):
             change = plan.states - nominal.states
             lateral, speed = change[np.abs(change).argmax(axis=0), range(4)][[1, 3]]

@@ -80,6 +80,10 @@ class Mpc:
         """What is left of the last solution after a failure, while that is more than half of it."""
         return self._rest
 
+    def drop_rest(self) -> None:
+        """Forget what is left of the last solution: the ego has not driven along it."""
+        self._rest = None
+
     def reset(self) -> None:
         """Forget the last solution."""
         self._warm = self._rest = None
@@ -98,7 +102,7 @@ class Mpc:
             solution = self._rescued(problem, instance, self._hold(problem), solution)
         if solution.solved:
             self._rest = Guess(solution.states, solution.controls)
-            self._warm = self._shifted(solution)
+            self._warm = self._shifted(solution, float(problem.road_curvature[-1]))
         else:
             self._warm = None
         return solution
@@ -164,11 +168,11 @@ class Mpc:
             controls.append(control)
         return Guess(np.array(states), np.array(controls))
 
-    def _shifted(self, solution: Solution) -> Guess:
+    def _shifted(self, solution: Solution, road_curvature: float) -> Guess:
         """Shift a solution by one step in time: the last control is held."""
         states, controls = solution.states, solution.controls
         final, held = states[-1].tolist(), controls[-1].tolist()
-        last = dynamics.step(final, held, DT, self.settings.friction)
+        last = dynamics.step(final, held, DT, self.settings.friction, road_curvature)
         return Guess(
             np.concatenate((states[1:], np.array(last)[None])),
             np.concatenate((controls[1:], controls[-1:])),

@@ -96,19 +96,28 @@ class CohesivePlanner:
         """Plan one step, in the paper's order."""
         # 1. Who and what: the groups' social features (section III-D and III-B).
         # 2. When: their agreement, by sample variance (section III-C).
+        assert self._mpc is not None, "call reset(road) before plan()"
+        driven, self._driven = self._driven, None
+        if driven is None:
+            self._mpc.drop_rest()  # the step before was not this plan's
         start = perf_counter()
         groups, place = self._agreement(observation, history)
         social_time = perf_counter() - start
         # 3. How: trade the ego's reward against cohesion (eq. 2) by MPC (section II-A).
-        assert self._mpc is not None, "call reset(road) before plan()"
-        solution = self._mpc.solve(self._problem(observation, groups, place))
+        solution = self._mpc.solve(self._problem(observation, groups, place, driven))
         # 4. Never without a plan: after a failed solve the last plan goes on, or the ego brakes.
         plan = self._to_plan(observation, solution, groups, place, social_time)
         # 5. Never a plan without a way out: visible cars come before whatever was agreed.
         if self.settings.last_resort:
             plan = checked(plan, observation, self._road, self.settings)
+        if plan.intervened:
+            self._mpc.drop_rest()
         self._driven = plan.controls[0]
         return plan
+
+    def continue_from(self, control: Control | None) -> None:
+        """Take a control as the one driven last, whoever planned it; None if nobody did."""
+        self._driven = control
 
     def _agreement(
         self, observation: Observation, history: History
@@ -126,7 +135,11 @@ class CohesivePlanner:
         return groups, place
 
     def _problem(
-        self, observation: Observation, groups: tuple[Agreement, ...], place: Place
+        self,
+        observation: Observation,
+        groups: tuple[Agreement, ...],
+        place: Place,
+        driven: Control | None,
     ) -> Problem:
         horizon, ego = self.settings.horizon, observation.ego
         # Where the ego will be if it keeps its speed: the road is looked up there.
@@ -163,7 +176,7 @@ class CohesivePlanner:
             place_target=place_target,
             # The more, the more cohesion could win by coming too close.
             constraint_weight=np.array([self.settings.constraint * (1.0 + pressure)]),
-            driven=self._driven,
+            driven=driven,
         )
 
     def _place(self, place: Place) -> tuple[FloatArray, FloatArray]:

@@ -44,7 +44,7 @@ def checked(plan: Plan, observation: Observation, road: Road, settings: PlannerS
     # The curvature with which the ego goes parallel to the road after one step.
     level = bend * cos(ego.heading) / (1.0 - bend * ego.d)
     level -= ego.heading / (DT * max(after[3], 1.0))
-    sharpest = settings.sharpest(ego.speed)
+    sharpest = settings.sharpest(max(ego.speed, after[3]))
     level = min(max(level, -sharpest), sharpest)
     hardest = settings.friction * ego.speed - min(settings.max_braking, ego.speed / DT)
     curvature, acceleration, reasons = control.curvature, control.acceleration, []

@@ -182,7 +182,9 @@ def make_instance(problem: Problem, stages: FloatArray, settings: PlannerSetting
 @lru_cache(maxsize=32)
 def _largest_change(settings: PlannerSettings) -> FloatArray:
     per_step = (DT * settings.max_curvature_rate / SCALES[0], DT * settings.max_jerk / SCALES[1])
-    return np.tile(per_step, (settings.horizon, 1))
+    change = np.tile(per_step, (settings.horizon, 1))
+    change.setflags(write=False)  # everybody's
+    return change
 
 
 def control_bounds(settings: PlannerSettings, speed: float) -> tuple[FloatArray, FloatArray]:
@@ -201,7 +203,9 @@ def control_bounds(settings: PlannerSettings, speed: float) -> tuple[FloatArray,
     if settings.sharpest(speed + gain * horizon) == settings.max_curvature:
         high[:, 0] = settings.max_curvature / SCALES[0]
     else:
-        high[:, 0] = [settings.sharpest(speed + gain * t) / SCALES[0] for t in range(horizon)]
+        high[:, 0] = [
+            settings.sharpest(speed + gain * t) / SCALES[0] for t in range(1, horizon + 1)
+        ]
     low[:, 0] = -high[:, 0]
     low[:, 1] = (drag - settings.max_braking) / SCALES[1]
     high[:, 1] = (drag + settings.max_acceleration) / SCALES[1]
@@ -233,7 +237,8 @@ def control_limits(
 def rate_excess(state: Any, control: Any, change: Any, settings: PlannerSettings) -> Any:
     """How much more than it may a control differs from the one before; (4,), none positive.
 
-    The same limits as control_limits, for solvers that take them as constraints.
+    The limits of control_limits, for solvers that take them as constraints: but where a stage's
+    bounds leave no such control, the problem has no solution.
     """
     last, stop = state[4:], standstill(state, settings)
     highest = ca.vertcat(last[0] + change[0], ca.fmax(last[1] + change[1], stop))

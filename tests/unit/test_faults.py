@@ -39,9 +39,11 @@ def assert_can_be_driven(plan: Plan, ego: RoadState) -> None:
     assert np.isfinite([curvature, acceleration]).all()
     assert abs(curvature) <= SETTINGS.max_curvature + 1e-6
     drag = SETTINGS.friction * ego.speed
+    assert drag - SETTINGS.max_braking - 1e-4 <= acceleration
     assert acceleration <= drag + SETTINGS.max_acceleration + 1e-4
-    stops = (acceleration - drag) * 0.1 >= -ego.speed - 1e-6
-    assert acceleration >= drag - SETTINGS.max_braking - 1e-4 or not stops
+    after = ego.speed + 0.1 * (acceleration - drag)
+    assert after >= -1e-6  # no car reverses
+    assert after**2 * abs(curvature) <= SETTINGS.max_lateral_acceleration * (1.0 + 1e-3)
     assert plan.status
 
 

@@ -194,7 +194,7 @@ def test_only_a_known_place_pulls(highway: Road) -> None:
     n = len(planner._place_steps)
     unknown = (0.0,) * (n - 1)
     place = Place(2, (1.6, *[0.4] * (n - 1)), (0.0, *unknown), (400.0, *unknown), 9.0)
-    problem = planner._problem(observation((300.0, 0.4, 0.0, 25.0), []), (), place)
+    problem = planner._problem(observation((300.0, 0.4, 0.0, 25.0), []), (), place, None)
     assert problem.place_target == pytest.approx(np.full(SETTINGS.horizon, 1.6))
     assert problem.place_weight[0] == problem.place_weight.max() > 0.0
     assert (problem.place_weight[planner._place_steps[1] - 1 :] == 0.0).all()
@@ -214,7 +214,7 @@ def test_warm_start_shifts_time_not_controls(highway: Road) -> None:
     t = SETTINGS.horizon
     states = np.arange(4.0 * (t + 1)).reshape(t + 1, 4)
     controls = np.column_stack((np.arange(float(t)), 10.0 + np.arange(float(t))))
-    shifted = mpc._shifted(Solution(states, controls, True, "solved", 1, 0.0, {}))
+    shifted = mpc._shifted(Solution(states, controls, True, "solved", 1, 0.0, {}), 0.0)
     u = shifted.controls
     assert np.array_equal(shifted.states[:-1], states[1:])
     assert u[:, 0] == pytest.approx([*range(1, t), t - 1])
@@ -225,7 +225,7 @@ def test_a_problem_that_is_not_a_number_is_refused(highway: Road) -> None:
     planner = CohesivePlanner(SETTINGS, CohesionSettings())
     planner.reset(highway)
     scene = observation((100.0, 0.0, 0.0, 25.0), [])
-    problem = planner._problem(scene, (), NOWHERE)
+    problem = planner._problem(scene, (), NOWHERE, None)
     assert planner._mpc is not None
     broken: Problem = replace(problem, ego=np.array([np.nan, 0.0, 0.0, 25.0]))
     solution = planner._mpc.solve(broken)

@@ -173,7 +173,7 @@ def hold_limits(solution: Solution, instance: Problem) -> None:
     speed = float(instance.ego[3])
     curvature, acceleration = solution.controls.T
     assert np.abs(curvature).max() <= SETTINGS.max_curvature + 1e-9
-    aside = np.abs(curvature) * solution.states[:-1, 3] ** 2
+    aside = np.abs(curvature) * solution.states[1:, 3] ** 2
     assert aside.max() <= SETTINGS.max_lateral_acceleration * (1.0 + 1e-6) + 1e-6
     drag = SETTINGS.friction * speed
     stops = acceleration * 0.1 <= -solution.states[:-1, 3] * (1.0 - SETTINGS.friction * 0.1) + 1e-6
