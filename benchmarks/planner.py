@@ -15,11 +15,15 @@ pass of its derivatives, the least that any method needs.
 
 from __future__ import annotations
 
+import os
+
+# CPU time is measured: L-BFGS would be charged for threads that wait for each other.
+os.environ["OPENBLAS_NUM_THREADS"] = "1"
+
 import argparse
 import contextlib
 import io
 import json
-import os
 import time
 from collections.abc import Callable, Iterator
 from importlib.metadata import version
@@ -127,30 +131,53 @@ class DoMpc(Peer):
         self._controller = controller
         self._ready = False
 
+    def _places(self) -> None:
+        """Find where each number stands in do-mpc's flat vectors; its names are slow to use."""
+        controller, t = self._controller, self.settings.horizon
+
+        def numbered(structure: Any) -> Any:
+            structure.master = ca.DM(np.arange(structure.shape[0]))
+            return structure
+
+        def at(value: Any) -> np.ndarray:
+            return np.asarray(value).ravel().astype(int)
+
+        template = numbered(controller.get_tvp_template())
+        self._p = np.array([at(template["_tvp", k, "p"]) for k in range(t + 1)])
+        self._most = np.array([at(template["_tvp", k, "most"]) for k in range(t + 1)])
+        whole = numbered(controller._opt_x(0))
+        self._u = np.array([at(whole["_u", k, 0]) for k in range(t)])
+        self._x = np.array([at(whole["_x", k, 0, -1]) for k in range(t + 1)])
+        self._template.master = 0.0
+
     def solve(self, instance: Instance, guess: Guess) -> tuple[np.ndarray, bool]:
-        controller, horizon = self._controller, self.settings.horizon
-        for t in range(horizon + 1):
-            self._template["_tvp", t, "p"] = instance.stages[min(t, horizon - 1)]
-            self._template["_tvp", t, "most"] = instance.change[min(t, horizon - 1)]
+        controller, last = (
+            self._controller,
+            np.minimum(np.arange(self.settings.horizon + 1), self.settings.horizon - 1),
+        )
         if not self._ready:
             controller.setup()
+            self._places()
             self._ready = True
-        for t in range(horizon):
-            controller.lb_opt_x["_u", t, 0] = instance.low[t]
-            controller.ub_opt_x["_u", t, 0] = instance.high[t]
-        whole = with_controls(instance, guess)
+        varying = np.zeros(self._template.shape[0])
+        varying[self._p], varying[self._most] = instance.stages[last], instance.change[last]
+        self._template.master = ca.DM(varying)
+        for bounds, values in (
+            (controller._lb_opt_x, instance.low),
+            (controller._ub_opt_x, instance.high),
+        ):
+            flat = np.asarray(bounds.master).ravel().copy()
+            flat[self._u] = values
+            bounds.master = ca.DM(flat)
+        start = np.asarray(controller.opt_x_num.master).ravel().copy()
+        start[self._u] = guess.controls / CONTROL_SCALE
+        start[self._x] = with_controls(instance, guess)
+        controller.opt_x_num.master = ca.DM(start)
         controller.x0 = instance.start
         controller.u0 = guess.controls[0] / CONTROL_SCALE
-        controller.set_initial_guess()
-        for t in range(horizon):
-            controller.opt_x_num["_u", t, 0] = (
-                guess.controls[t] / CONTROL_SCALE / controller._u_scaling.cat
-            )
-        for t in range(horizon + 1):
-            controller.opt_x_num["_x", t, 0, -1] = whole[t]
         controller.make_step(instance.start[:, None])
-        controls = [np.asarray(controller.opt_x_num["_u", t, 0]).ravel() for t in range(horizon)]
-        return np.array(controls), bool(controller.solver_stats["success"])
+        controls = np.asarray(controller.opt_x_num.master).ravel()[self._u]
+        return controls, bool(controller.solver_stats["success"])
 
 
 class Rockit(Peer):
@@ -173,7 +200,7 @@ class Rockit(Peer):
         ocp.subject_to(ocp.at_t0(x) == start)
         ocp.subject_to(x[3] >= 0, include_first=False)
         ocp.subject_to(self.rates(x, u, most) <= 0, include_last=False)
-        options: dict[str, Any] = {"print_time": False, "error_on_fail": False}
+        options: dict[str, Any] = {"print_time": False, "error_on_fail": True, "expand": True}
         if solver == "fatrop":
             options |= {"structure_detection": "auto", "fatrop.print_level": 0, "debug": False}
             options["fatrop.max_iter"] = settings.max_iterations
@@ -192,17 +219,13 @@ class Rockit(Peer):
         self._function = ocp.to_function("solve", [*given, states, controls], [controls])
 
     def solve(self, instance: Instance, guess: Guess) -> tuple[np.ndarray, bool]:
-        found = self._function(
-            instance.stages.T,
-            instance.change.T,
-            instance.low.T,
-            instance.high.T,
-            instance.start,
-            with_controls(instance, guess).T,
-            (guess.controls / CONTROL_SCALE).T,
-        )
-        controls = np.asarray(found).T
-        return controls, bool(np.isfinite(controls).all())
+        given = (instance.stages, instance.change, instance.low, instance.high)
+        start = (with_controls(instance, guess).T, (guess.controls / CONTROL_SCALE).T)
+        try:
+            found = self._function(*[rows.T for rows in given], instance.start, *start)
+        except RuntimeError:
+            return np.full((self.settings.horizon, 2), np.nan), False
+        return np.asarray(found).T, True
 
 
 def with_controls(instance: Instance, guess: Guess) -> np.ndarray:
@@ -333,8 +356,11 @@ def _states(host: Mpc, problem: Problem, controls: np.ndarray) -> np.ndarray:
 
 def floor(horizon: int) -> dict[str, float]:
     """Microseconds of one evaluation of the objective and of one derivative pass, compiled."""
-    solver = mpc_module.Ilqr(PlannerSettings(horizon=horizon), 3)
-    found = {}
+    problem = record(horizon, len(RECORDED))[0]
+    host = Mpc(PlannerSettings(horizon=horizon), problem.lanes.shape[0])
+    host.solve(problem)
+    solver, found = host.solver, {}
+    assert isinstance(solver, mpc_module.Ilqr)
     for name, run in (("objective", solver._run_forward), ("derivatives", solver._run_exact)):
         times = []
         for _ in range(2000):

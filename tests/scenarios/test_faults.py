@@ -49,21 +49,25 @@ class OftenFaulty:
 
 @pytest.fixture
 def moved(monkeypatch: pytest.MonkeyPatch) -> list[tuple[float, ...]]:
-    """Everything that is sent to SUMO as the ego's state."""
+    """Everything that is sent to SUMO as a state; Simulator.step refuses what is no number."""
     sent: list[tuple[float, ...]] = []
     step = Simulator.step
 
-    def record(self: Simulator, ego, *others) -> None:  # type: ignore[no-untyped-def]
-        if ego is not None:
-            sent.append(tuple(ego))
-        step(self, ego, *others)
+    def record(self: Simulator, ego, others) -> None:  # type: ignore[no-untyped-def]
+        sent.extend(tuple(state) for state in (ego, *others.values()) if state is not None)
+        step(self, ego, others)
 
     monkeypatch.setattr(Simulator, "step", record)
     return sent
 
 
 def run_with_faults(
-    monkeypatch: pytest.MonkeyPatch, scenario: str, planner: str, *, rescue: bool
+    monkeypatch: pytest.MonkeyPatch,
+    scenario: str,
+    planner: str,
+    *,
+    rescue: bool,
+    penetration: float = 0.0,
 ) -> tuple[Rollout, list[str]]:
     """Drive with solvers that fail; without rescue IPOPT fails whenever it is asked."""
     count: list[str] = []
@@ -77,7 +81,8 @@ def run_with_faults(
         return OftenFaulty(real(name, *about), rng, count)  # type: ignore[arg-type]
 
     monkeypatch.setattr(mpc, "shared_solver", faulty)
-    rollout = run(scenario, planner, 1003, overrides={"reference": False, "success": {}})
+    overrides = {"reference": False, "success": {}, "fleet.penetration": penetration}
+    rollout = run(scenario, planner, 1003, overrides=overrides)
     return rollout, count
 
 
@@ -120,3 +125,17 @@ def test_the_nominal_planner_is_as_sturdy(
     assert not rollout.metrics["collision"].iloc[0]
     speeds = pd.Series([state[3] for state in moved])
     assert speeds.between(0.0, 40.0).all()
+
+
+def test_a_fleet_is_as_sturdy(
+    moved: list[tuple[float, ...]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rollout, count = run_with_faults(
+        monkeypatch, "nothing_to_follow", "cohesive", rescue=False, penetration=1.0
+    )
+    row = rollout.metrics.iloc[0]
+    assert row["plan_failures"] + row["fleet_failures"] >= len(count) > 50
+    assert len(moved) > 2 * len(rollout.plan)
+    assert np.isfinite(np.array(moved)).all()
+    assert not row["collision"]
+    assert row["fleet_collisions"] == 0

@@ -124,7 +124,7 @@ def one(rollout: Rollout, name: str) -> pd.DataFrame:
     return rollout.trajectory[rollout.trajectory["vehicle"] == name]
 
 
-def test_without_a_fleet_nothing_is_different() -> None:
+def test_without_a_fleet_the_ego_is_alone_and_whom_egos_follow_is_nothing_to_it() -> None:
     short = {"duration": 5.0}
     plain = run("stalled_swerve", "cohesive", 1000, overrides=short)
     none = run(

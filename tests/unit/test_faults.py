@@ -7,6 +7,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from sumo_cohesion.perception.history import History
 from sumo_cohesion.planning import mpc
 from sumo_cohesion.planning.planners import CohesivePlanner
 from sumo_cohesion.planning.problem import Guess, Instance, Solution
@@ -182,19 +183,43 @@ def test_if_all_solvers_always_fail_the_ego_brakes_in_its_lane(
 
 
 def test_if_all_solvers_fail_now_the_last_plan_goes_on_for_half_its_length(highway: Road) -> None:
-    ego = RoadState(100.0, 0.3, 0.0, 20.0)
-    observation = observed(0.0, ego, np.zeros((0, 4)))
-    history = new_history(COHESION, 0.1)
-    history.push(observation)
     planner = CohesivePlanner(SETTINGS, COHESION)
     planner.reset(highway)
-    good = planner.plan(observation, history)
-    planner._mpc.solver = Faulty(planner._mpc.solver, "raises")  # type: ignore[union-attr]
-    planner._mpc._rescued = lambda *about: about[-1]  # type: ignore[union-attr,method-assign]
+    history = new_history(COHESION, 0.1)
+    good = planned(planner, RoadState(100.0, 0.3, 0.0, 20.0), history)
+    break_solvers(planner)
     for k in range(1, 5):
-        plan = planner.plan(observation, history)
+        plan = planned(planner, RoadState(*good.states[k]), history)
         assert plan.fallback
         assert plan.controls == good.controls[k:]
-    plan = planner.plan(observation, history)
+        assert np.array(plan.states) == pytest.approx(good.states[k:])
+    ego = RoadState(*good.states[5])
+    plan = planned(planner, ego, history)
     assert plan.fallback
-    assert plan.controls[0].acceleration == pytest.approx(SETTINGS.friction * 20.0 - 4.0)
+    assert plan.controls[0].acceleration == pytest.approx(SETTINGS.friction * ego.speed - 4.0)
+
+
+def test_a_plan_that_was_not_driven_does_not_go_on(highway: Road) -> None:
+    """The last resort changed it: what is left of it starts where the ego is not."""
+    planner = CohesivePlanner(SETTINGS, COHESION)
+    planner.reset(highway)
+    history = new_history(COHESION, 0.1)
+    ego = RoadState(100.0, 0.0, 0.0, 20.0)
+    near = np.array([[122.0, 0.0, 0.0, 10.0]])
+    history.push(observed(0.0, ego, near))
+    assert planner.plan(observed(0.0, ego, near), history).intervened
+    break_solvers(planner)
+    plan = planned(planner, RoadState(102.0, 0.0, 0.0, 19.2), history)
+    assert plan.fallback
+    assert len(plan.controls) == 1
+
+
+def planned(planner: CohesivePlanner, ego: RoadState, history: History) -> Plan:
+    observation = observed(0.0, ego, np.zeros((0, 4)))
+    history.push(observation)
+    return planner.plan(observation, history)
+
+
+def break_solvers(planner: CohesivePlanner) -> None:
+    planner._mpc.solver = Faulty(planner._mpc.solver, "raises")  # type: ignore[union-attr]
+    planner._mpc._rescued = lambda *about: about[-1]  # type: ignore[union-attr,method-assign]
