@@ -103,7 +103,12 @@ def test_ctrl_c_stops_with_one_line_and_keeps_what_is_done(
 ) -> None:
     file, out = toml(SHORT, tmp_path / "short.toml"), tmp_path / "out"
     process = subprocess.Popen(
-        command(file, out, "--workers", "1"), cwd=REPOSITORY, stderr=subprocess.PIPE, text=True
+        command(file, out, "--workers", "1"),
+        cwd=REPOSITORY,
+        stderr=subprocess.PIPE,
+        text=True,
+        # Tests that run in the background of a shell inherit that Ctrl-C is ignored.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
     journal = out / "runs" / "1of1-00001.jsonl"
     for _ in range(300):
