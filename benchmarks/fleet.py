@@ -10,7 +10,6 @@ social and planning of all of them, one after the other in one process.
 from __future__ import annotations
 
 import argparse
-import subprocess
 import tempfile
 from collections import defaultdict
 from collections.abc import Callable, Iterator
@@ -24,6 +23,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from benchmarks.rooms import write_highway
 from sumo_cohesion.experiments import fleet as fleet_module
 from sumo_cohesion.experiments.fleet import Fleet
 from sumo_cohesion.experiments.rollout import Rollout, versions
@@ -40,7 +40,7 @@ LANES, SPACING, AT_LEAST = 5, 16.0, 100
 SCENARIO = """
 name = "crowd"
 summary = "A dense highway on which a planner drives every car."
-network = "crowd.net.xml"
+network = "long.net.xml"
 routes = ["crowd.rou.xml"]
 duration = {duration}
 [ego]
@@ -60,17 +60,7 @@ collision = false
 
 def write_crowd(folder: Path, seconds: float) -> Path:
     """Write a straight highway in 1 km edges, filled for a kilometre, the ego in its middle."""
-    n = int(seconds * 20 / 1000) + 3
-    nodes = "".join(f'<node id="n{i}" x="{1000 * i}" y="0"/>' for i in range(n + 1))
-    edges = "".join(
-        f'<edge id="e{i}" from="n{i}" to="n{i + 1}" numLanes="{LANES}" width="3.5" speed="15"/>'
-        for i in range(n)
-    )
-    (folder / "crowd.nod.xml").write_text(f"<nodes>{nodes}</nodes>")
-    (folder / "crowd.edg.xml").write_text(f"<edges>{edges}</edges>")
-    options = ["--offset.disable-normalization", "true", "--no-turnarounds", "true"]
-    files = ["-n", "crowd.nod.xml", "-e", "crowd.edg.xml", "-o", "crowd.net.xml"]
-    subprocess.run(["netconvert", *files, *options], cwd=folder, check=True, capture_output=True)
+    n = write_highway(folder, seconds, LANES, 15.0) + 1
     rng = np.random.default_rng(0)
     places = np.arange(20.0, 990.0, SPACING)
     middle = places.size // 2

@@ -28,7 +28,7 @@ HUMANS, EGO_PLACE = 50, 25
 
 def write_platoon(folder: Path, seconds: float) -> Path:
     """Write a highway and 50 humans on three lanes, the ego in their middle."""
-    last = write_highway(folder, seconds / 60)
+    last = write_highway(folder, seconds)
     cars = "".join(
         f'<vehicle id="h{i}" type="human" route="all" depart="0" departLane="{i % 3}" '
         f'departPos="{20 + 30 * (i // 3) + 10 * (i % 3)}" departSpeed="desired"/>'

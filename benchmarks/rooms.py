@@ -61,12 +61,13 @@ def timed_rollout(scenario: str | Path, seed: int, overrides: dict[str, Any]) ->
     return rollout.timing.assign(step_ms=steps[: len(rollout.timing)])
 
 
-def write_highway(folder: Path, minutes: float) -> int:
-    """Write a straight highway in 1 km edges, long enough for the drive; returns its last edge."""
-    n = int(minutes * 60 * 30 / 1000) + 3
+def write_highway(folder: Path, seconds: float, n_lanes: int = 3, speed: float = 25.0) -> int:
+    """Write long.net.xml, straight, in 1 km edges, long enough for the drive; returns its last."""
+    n = int(seconds * (speed + 5.0) / 1000) + 3
     nodes = "".join(f'<node id="n{i}" x="{1000 * i}" y="0"/>' for i in range(n + 1))
     edges = "".join(
-        f'<edge id="e{i}" from="n{i}" to="n{i + 1}" numLanes="3" width="3.5" speed="25"/>'
+        f'<edge id="e{i}" from="n{i}" to="n{i + 1}" numLanes="{n_lanes}" width="3.5" '
+        f'speed="{speed}"/>'
         for i in range(n)
     )
     (folder / "long.nod.xml").write_text(f"<nodes>{nodes}</nodes>")
@@ -79,7 +80,7 @@ def write_highway(folder: Path, minutes: float) -> int:
 
 def write_long_highway(folder: Path, minutes: float) -> Path:
     """Write such a highway with a stream on it."""
-    n = write_highway(folder, minutes) + 1
+    n = write_highway(folder, 60 * minutes) + 1
     route = " ".join(f"e{i}" for i in range(n))
     flows = "".join(
         f'<flow id="f{lane}" type="human" route="all" begin="0" end="40" period="2.5" '

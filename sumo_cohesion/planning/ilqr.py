@@ -3,8 +3,8 @@
 Per iteration one backward pass (a quadratic model of the cost-to-go, stage by stage, Riccati) and
 forward passes (roll the policy out, with shorter steps until the cost falls). The steps come from
 the exact Hessian where it is convex enough, else from a Gauss-Newton one, which always descends.
-Bounds on the controls are part of every stage's quadratic problem in two unknowns, which is solved
-exactly.
+Bounds on the controls and on their change are part of every stage's quadratic problem in two
+unknowns, which is solved exactly.
 
 Sources: W. Li and E. Todorov 2004 (iterative LQR); Y. Tassa, N. Mansard and E. Todorov 2014
 (control-limited DDP, the line search and the regularisation).

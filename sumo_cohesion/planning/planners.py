@@ -224,13 +224,13 @@ class CohesivePlanner:
         assert self._mpc is not None
         rows = explain(observation, groups, place, self.cohesion.beta, self._road)
         rest = self._mpc.rest
-        if not solution.solved and rest is None:
-            braking = fallback(observation, self._road, self.settings, solution.status)
-            controls, states = braking.controls, braking.states
-        elif not solution.solved and rest is not None:
+        if solution.solved:
+            controls, states = _controls(solution.controls), solution.states
+        elif rest is not None:
             controls, states = _controls(rest.controls), rest.states
         else:
-            controls, states = _controls(solution.controls), solution.states
+            braking = fallback(observation, self._road, self.settings, solution.status)
+            controls, states = braking.controls, braking.states
         return Plan(
             controls=controls,
             states=states,

@@ -58,10 +58,7 @@ def group_votes(ego: RoadState, history: History, road: Road, settings: Cohesion
 
 def _vote_at_place(track: Track, ego: RoadState, settings: CohesionSettings) -> Vote | None:
     """Mean features of one car's transitions around the ego's place; None if it kept aside."""
-    middle, reach = track.middle_s, settings.position_length
-    if not middle or middle[-1] < ego.s - reach or middle[0] > ego.s + reach:
-        return None
-    passed = track.passed(ego.s, reach)
+    passed = track.passed(ego.s, settings.position_length)
     across, d, width = track.middle_d, ego.d, settings.position_width
     here = [i for i in passed if abs(across[i] - d) <= width]
     if not here:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from sumo_cohesion.experiments.drive import ask, drive
 from sumo_cohesion.perception.history import History
 from sumo_cohesion.planning import mpc
 from sumo_cohesion.planning.planners import CohesivePlanner
@@ -15,7 +18,7 @@ from sumo_cohesion.planning.settings import PlannerSettings
 from sumo_cohesion.road import Road
 from sumo_cohesion.social.memory import new_history
 from sumo_cohesion.social.settings import CohesionSettings
-from sumo_cohesion.state import RESCUED, Observation, Plan, RoadState
+from sumo_cohesion.state import RESCUED, CartesianState, Control, Observation, Plan, RoadState
 
 SETTINGS = PlannerSettings()
 COHESION = CohesionSettings()
@@ -223,3 +226,39 @@ def planned(planner: CohesivePlanner, ego: RoadState, history: History) -> Plan:
 def break_solvers(planner: CohesivePlanner) -> None:
     planner._mpc.solver = Faulty(planner._mpc.solver, "raises")  # type: ignore[union-attr]
     planner._mpc._rescued = lambda *about: about[-1]  # type: ignore[union-attr,method-assign]
+
+
+def test_whoever_planned_what_was_driven_it_bounds_the_next_control(highway: Road) -> None:
+    tight = SETTINGS.model_copy(update={"max_jerk": 10.0})
+    planner = CohesivePlanner(tight, COHESION)
+    for driven in (-5.0, 0.0, 3.0):
+        planner.reset(highway)
+        planner.continue_from(Control(0.0, driven))
+        plan = planned(planner, RoadState(100.0, 0.0, 0.0, 15.0), new_history(COHESION, 0.1))
+        assert abs(plan.controls[0].acceleration - driven) <= 1.0 + 1e-5
+
+
+def test_no_car_reverses_whatever_a_planner_wants() -> None:
+    state = CartesianState(0.0, 0.0, 0.0, 1.0)
+    for _ in range(3):
+        plan = Plan((Control(0.0, -99.0),), np.zeros((1, 4)), "mine")
+        after = drive(state, plan, SETTINGS)
+        assert after is not None
+        assert after.x == pytest.approx(state.x, abs=1e-9)
+        assert after.speed == pytest.approx(0.0, abs=1e-9)
+        state = after
+
+
+@pytest.mark.parametrize("controls", [((0.001, 1.0),), np.full((10, 2), 0.001), [[0.001, 1.0]]])
+def test_a_users_controls_may_be_any_pairs(highway: Road, controls: Any) -> None:
+    class Mine:
+        def reset(self, road: Road) -> None: ...
+
+        def plan(self, observation: Observation, history: History) -> Plan:
+            return Plan(controls, np.zeros((1, 4)), "mine")
+
+    seen = observed(0.0, RoadState(100.0, 0.0, 0.0, 20.0), np.zeros((0, 4)))
+    plan = ask(Mine(), seen, new_history(COHESION, 0.1), highway, SETTINGS)
+    assert not plan.fallback
+    assert isinstance(plan.controls[0], Control)
+    assert plan.controls[0].curvature == 0.001
