@@ -22,6 +22,7 @@ os.environ["OPENBLAS_NUM_THREADS"] = "1"
 
 import argparse
 import contextlib
+import copy
 import io
 import json
 import time
@@ -37,8 +38,10 @@ import pandas as pd
 from sumo_cohesion.experiments.rollout import versions
 from sumo_cohesion.experiments.setup import prepare
 from sumo_cohesion.experiments.simulation import simulate
+from sumo_cohesion.planning import dynamics
 from sumo_cohesion.planning import mpc as mpc_module
-from sumo_cohesion.planning.mpc import Mpc
+from sumo_cohesion.planning.instance import Desk
+from sumo_cohesion.planning.mpc import Mpc, shifted
 from sumo_cohesion.planning.planners import make_planner
 from sumo_cohesion.planning.problem import Guess, Instance, Problem, Solution
 from sumo_cohesion.planning.settings import PlannerSettings
@@ -47,7 +50,6 @@ from sumo_cohesion.planning.stage import (
     N_STATES,
     StageParameters,
     limited_stage,
-    make_instance,
     make_stage,
     rate_excess,
 )
@@ -306,14 +308,10 @@ class Judge:
 def compare(horizon: int, n: int) -> pd.DataFrame:
     settings = PlannerSettings(horizon=horizon)
     problems = record(horizon, n)
-    n_lanes = max(problem.lanes.shape[0] for problem in problems)
-    problems = [problem for problem in problems if problem.lanes.shape[0] == n_lanes]
-    host = Mpc(settings, n_lanes)
-    instances = []
-    for problem in problems:
-        stages = np.zeros_like(host._stages)
-        host._parameters.fill(problem, stages)
-        instances.append(make_instance(problem, stages, settings))
+    n_lanes = max(map(lanes_of, problems))
+    problems = [problem for problem in problems if lanes_of(problem) == n_lanes]
+    host, desk = Mpc(settings, n_lanes), Desk(settings, n_lanes)
+    instances = [copy.deepcopy(desk.write(problem)) for problem in problems]
     judge, rows = Judge(settings, n_lanes), []
     built = methods(settings, n_lanes)
     warm: dict[str, Guess | None] = dict.fromkeys(built)
@@ -333,10 +331,7 @@ def compare(horizon: int, n: int) -> pd.DataFrame:
                 ms = float(np.median(took))
                 rows.append((name, start, i, ms, took[0], value, nothing, solved))
             if solved:
-                plan = Solution(
-                    _states(host, problem, controls), controls * CONTROL_SCALE, True, "", 0, 0.0, {}
-                )
-                warm[name] = host._shifted(plan, float(problem.road_curvature[-1]))
+                warm[name] = next_guess(settings, problem, controls * CONTROL_SCALE)
     columns = ["method", "start", "instance", "ms", "first_ms", "reward", "nothing", "solved"]
     table = pd.DataFrame(rows, columns=columns)
     table["best"] = table.groupby("instance")["reward"].transform("max")
@@ -347,19 +342,24 @@ def compare(horizon: int, n: int) -> pd.DataFrame:
     return table.assign(horizon=horizon)
 
 
-def _states(host: Mpc, problem: Problem, controls: np.ndarray) -> np.ndarray:
-    from sumo_cohesion.planning import dynamics
+def next_guess(settings: PlannerSettings, problem: Problem, controls: np.ndarray) -> Guess:
+    """Return a plan shifted by one step, its last control held."""
+    bends = problem.road.rows[:-1, -1].tolist()
+    states = [tuple(problem.ego)]
+    for u, bend in zip(controls, bends, strict=True):
+        states.append(dynamics.step(states[-1], u, 0.1, settings.friction, bend))
+    return shifted(Guess(np.array(states), controls), settings.friction, bends[-1])
 
-    states = [tuple(problem.ego.tolist())]
-    for u, curvature in zip(controls * CONTROL_SCALE, problem.road_curvature, strict=True):
-        states.append(dynamics.step(states[-1], u, 0.1, host.settings.friction, float(curvature)))
-    return np.array(states, dtype=float)
+
+def lanes_of(problem: Problem) -> int:
+    """Lanes of a problem's road: two columns each, and two more."""
+    return problem.road.rows.shape[1] // 2 - 1
 
 
 def floor(horizon: int) -> dict[str, float]:
     """Microseconds of one evaluation of the objective and of one derivative pass, compiled."""
     problem = record(horizon, len(RECORDED))[0]
-    host = Mpc(PlannerSettings(horizon=horizon), problem.lanes.shape[0])
+    host = Mpc(PlannerSettings(horizon=horizon), lanes_of(problem))
     host.solve(problem)
     solver, found = host.solver, {}
     assert isinstance(solver, mpc_module.Ilqr)

@@ -18,23 +18,21 @@ from sumo_cohesion.state import FloatArray, IntArray
 
 SPACING = 1.0
 """Metres between vertices of the reference line."""
+_SAME = 1e-6
+"""Metres per metre of road by which a lane's place may change and count as the same."""
 
 
 class RoadAhead(NamedTuple):
-    """The road at n places.
+    """The road at n places, one row each.
 
-    lanes, widths : (L, n) m; where a lane does not exist it is infinitely far and 1 m wide. Nor
-        does a lane off the route, as long as it has not parted from one of the route's.
-    right, left : (n,) m, borders of the paved strip.
-    speed_limit, curvature : (n,) m/s and 1/m.
+    rows : (n, 2 L + 2), columns: the L lanes' centres (m) and widths (m), speed limit (m/s) and
+        curvature (1/m). Where a lane does not exist it is infinitely far and 1 m wide. Nor does a
+        lane off the route, as long as it has not parted from one of the route's.
+    edges : (n, 2) m, right and left border of the paved strip.
     """
 
-    lanes: FloatArray
-    widths: FloatArray
-    right: FloatArray
-    left: FloatArray
-    speed_limit: FloatArray
-    curvature: FloatArray
+    rows: FloatArray
+    edges: FloatArray
 
 
 @dataclass(frozen=True)
@@ -74,6 +72,7 @@ class Road:
     _near: dict[tuple[int, int], int] = field(init=False, repr=False, compare=False)
     _centre_or_far: FloatArray = field(init=False, repr=False, compare=False)
     _ahead: FloatArray = field(init=False, repr=False, compare=False)
+    _same_until: IntArray = field(init=False, repr=False, compare=False)
     _bends: list[float] = field(init=False, repr=False, compare=False)
     _lane_rows: list[list[float]] = field(init=False, repr=False, compare=False)
     _strips: FloatArray = field(init=False, repr=False, compare=False)
@@ -96,9 +95,11 @@ class Road:
         # Side by side, so that one look finds everything.
         ahead = np.column_stack((forked, width, self.speed_limit, self.curvature))
         object.__setattr__(self, "_ahead", ahead)
+        object.__setattr__(self, "_same_until", _same_until(forked))
         object.__setattr__(self, "_bends", self.curvature.tolist())
         object.__setattr__(self, "_lane_rows", centre.tolist())
-        object.__setattr__(self, "_strips", _strips(self.lane_centre, self.lane_width))
+        strips = _strips(self.lane_centre, self.lane_width).reshape(-1, 2)
+        object.__setattr__(self, "_strips", strips)  # a row per vertex and lane
 
     def index(self, s: ArrayLike) -> IntArray:
         """Vertex nearest to each arc length s (m)."""
@@ -147,7 +148,7 @@ class Road:
         route is a strip of its own.
         """
         lane = self.lane_index(s, d)
-        right, left = self._strips[self.index(s), lane].T
+        right, left = self._strips[self.index(s) * self.lane_centre.shape[1] + lane].T
         return right, left
 
     def ahead(self, s: Sequence[float], d: float) -> RoadAhead:
@@ -158,16 +159,19 @@ class Road:
         """
         last, s0, n_lanes = self.x.size - 1, self.s0, self.lane_centre.shape[1]
         i = [min(max(round((place - s0) / SPACING), 0), last) for place in s]
-        table = self._ahead[i].T
+        rows = self._ahead.take(i, axis=0)
+        # One look is enough where nothing changes, as is usual.
+        unchanged = i[0] <= i[-1] <= self._same_until[i[0]]
         followed = []
-        for row in table[:n_lanes].T.tolist():
+        for row in rows[: 1 if unchanged else None, :n_lanes].tolist():
             off = [abs(centre - d) for centre in row]
             lane = off.index(min(off))
             d = row[lane] if isfinite(row[lane]) else d
             followed.append(lane)
-        right, left = self._strips[i, followed].T
-        limit, curvature = table[-2:]
-        return RoadAhead(table[:n_lanes], table[n_lanes:-2], right, left, limit, curvature)
+        if unchanged:
+            followed *= len(i)
+        strips = [vertex * n_lanes + lane for vertex, lane in zip(i, followed, strict=True)]
+        return RoadAhead(rows, self._strips.take(strips, axis=0))
 
     def project(self, x: float, y: float) -> tuple[float, float, float, float]:
         """Road coordinates of one Cartesian point.
@@ -252,6 +256,15 @@ def _forked(centre: FloatArray, width: FloatArray, n_route_lanes: int) -> FloatA
         nearest = np.abs(route - centre[:, lane : lane + 1]).min(axis=1)
         forked[nearest < width[:, lane] / 2, lane] = np.inf
     return forked
+
+
+def _same_until(centre: FloatArray) -> IntArray:
+    """Return the last vertex up to which the lanes stay where they are, from each vertex: (G,)."""
+    off = np.where(np.isinf(centre), -1e9, centre)
+    # What creeps in bends is far below this, and lanes are metres apart.
+    changes = np.flatnonzero((np.abs(np.diff(off, axis=0)) > _SAME).any(axis=1))
+    ends = np.append(changes, len(centre) - 1)
+    return np.asarray(ends[np.searchsorted(ends, np.arange(len(centre)))])
 
 
 def _strips(centre: FloatArray, width: FloatArray) -> FloatArray:

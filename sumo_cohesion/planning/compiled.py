@@ -26,7 +26,16 @@ from sumo_cohesion.state import FloatArray
 
 SWITCH = "SUMO_COHESION_COMPILE"
 """Environment variable; 0 keeps CasADi's virtual machine."""
-OPTIONS = ("-O2", "-ffp-contract=off", "-fPIC", "-shared")
+OPTIONS = (
+    "-O2",
+    "-ffp-contract=off",
+    "-fno-math-errno",
+    "-fno-trapping-math",
+    "-fno-semantic-interposition",
+    "-fPIC",
+    "-shared",
+)
+"""The three -fno- let calls be inlined that C's rules forbid to inline; no result changes."""
 _PATIENCE = 300.0
 """Seconds after which a compiler is given up."""
 

@@ -136,8 +136,7 @@ class Ilqr:
     def _load(self, instance: Instance, guess: Guess) -> None:
         self._p[:], self._x[0] = instance.stages, instance.start
         self._low[:], self._high[:], self._most[:] = instance.low, instance.high, instance.change
-        np.divide(guess.controls, CONTROL_SCALE, out=self._u)
-        np.minimum(np.maximum(self._u, self._low, out=self._u), self._high, out=self._u)
+        np.divide(guess.controls, CONTROL_SCALE, out=self._u)  # limited as it is rolled out
         self._step[:], self._gain[:] = 0.0, 0.0
 
     def _search(self, cost: float, promised: float) -> float | None:
@@ -215,6 +214,7 @@ def _riccati_step(stage: Stage, settings: PlannerSettings, *, exact: bool) -> An
     """One stage of the backward pass: the cost-to-go before it, from the one after it."""
     n = N_STATES
     gradient, hessian = ca.SX.sym("gradient", n), ca.SX.sym("hessian", n, n)
+    given_hessian, hessian = hessian, _symmetric(hessian)
     low, high, most = (ca.SX.sym(name, 2) for name in ("low", "high", "most"))
     mu = ca.SX.sym("mu")
     slope, model = _quadratic(stage, gradient, hessian, exact=exact)
@@ -231,14 +231,14 @@ def _riccati_step(stage: Stage, settings: PlannerSettings, *, exact: bool) -> An
     held = [ca.if_else(at_lowest[i], slopes[0][i, :], slopes[1][i, :]) for i in range(2)]
     gain = _gain(damped, ux, free, held)
     gradient_before = x_slope + gain.T @ (uu @ step + u_slope) + ux.T @ step
-    hessian_before = xx + gain.T @ uu @ gain + gain.T @ ux + ux.T @ gain
+    hessian_before = xx + gain.T @ (uu @ gain + ux) + ux.T @ gain
     change = ca.dot(step, u_slope) + 0.5 * ca.dot(step, uu @ step)
     return ca.Function(
         "riccati_exact" if exact else "riccati_gauss_newton",
-        [gradient, hessian, *stage.inputs(), low, high, most, mu],
+        [gradient, given_hessian, *stage.inputs(), low, high, most, mu],
         [
             gradient_before,
-            0.5 * (hessian_before + hessian_before.T),
+            _symmetric(hessian_before),
             step,
             gain,
             change,
@@ -251,27 +251,38 @@ def _riccati_step(stage: Stage, settings: PlannerSettings, *, exact: bool) -> An
 def _quadratic(stage: Stage, gradient: Any, hessian: Any, *, exact: bool) -> tuple[Any, Any]:
     """Gradient and Hessian, in (state, control), of a stage's cost and the cost-to-go after it.
 
-    The cost is a function of w = (landing, road state, control), of few of which most of it
-    depends; the chain rule does the rest. Exact: the dynamics' own curvature, weighted by all that
-    depends on where they lead, belongs to it (DDP).
+    The cost is a function of w = (landing, road state, control) and of the place relative to every
+    car, of few of which each part of it depends; the chain rule does the rest. Exact: the dynamics'
+    own curvature, weighted by all that depends on where they lead, belongs to it (DDP).
     """
     z = ca.vertcat(stage.state, stage.control)
-    w = ca.vertcat(stage.landing, stage.state[:4], stage.control)
-    of_w = ca.jacobian(ca.vertcat(stage.next_state[:4], stage.state[:4], stage.control), z)
-    move = ca.jacobian(stage.next_state, z)
+    here = ca.vertcat(stage.state[:4], stage.control)
+    w = ca.vertcat(stage.landing, here)
+    move, pick = ca.jacobian(stage.next_state, z), ca.jacobian(here, z)
+    v = ca.vertcat(w, stage.relative)
+    of_v = ca.jacobian(ca.vertcat(w, stage.relative_there), w)  # linear
     if exact:
-        curvature, by_w = ca.hessian(stage.cost, w)
+        curvature, by_v = ca.hessian(stage.cost, v)
     else:
-        by_w, rows = ca.gradient(stage.cost, w), ca.jacobian(stage.residuals, w)
-        curvature = rows.T @ (ca.repmat(stage.residual_weights, 1, w.shape[0]) * rows)
-    by_w, curvature = stage.landed(by_w, curvature)
-    slope = of_w.T @ by_w + move.T @ gradient
-    model = of_w.T @ curvature @ of_w + move.T @ hessian @ move
+        by_v, rows = ca.gradient(stage.cost, v), ca.jacobian(stage.residuals, v)
+        curvature = rows.T @ (ca.repmat(stage.residual_weights, 1, v.shape[0]) * rows)
+    by_w, curvature = stage.landed(of_v.T @ by_v, _symmetric(of_v.T @ curvature @ of_v))
+    # What it costs to land there adds to the cost-to-go from there.
+    gradient = gradient + ca.vertcat(by_w[:4], ca.SX(2, 1))
+    hessian = hessian + ca.diagcat(curvature[:4, :4], ca.SX(2, 2))
+    slope = move.T @ gradient + pick.T @ by_w[4:]
+    both = move[:4, :].T @ curvature[:4, 4:] @ pick
+    model = move.T @ hessian @ move + both + both.T + pick.T @ curvature[4:, 4:] @ pick
     if exact:
         price = ca.SX.sym("price", 4)
         bend, _ = ca.hessian(ca.dot(price, stage.next_state[:4]), z)
-        model += ca.substitute(bend, price, by_w[:4] + gradient[:4])
-    return slope, model
+        model += ca.substitute(bend, price, gradient[:4])
+    return slope, _symmetric(model)
+
+
+def _symmetric(matrix: Any) -> Any:
+    """Return the same symmetric matrix, of which only one half is worked out."""
+    return ca.triu2symm(ca.triu(matrix))
 
 
 def _box_step(h: Any, g: Any, low: Any, high: Any) -> tuple[Any, list[Any]]:

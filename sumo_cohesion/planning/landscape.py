@@ -40,7 +40,9 @@ def reward_landscape(
     right, left = road.drivable_at(s, np.full(s.shape, observation.ego.d))
     symbols = [ca.SX.sym(name) for name in ("s", "d", "right", "left")]
     lane, width = (ca.SX.sym(name, len(lanes)) for name in ("lanes", "widths"))
-    inputs = reward.StageInputs(lane, width, symbols[2], symbols[3], 0.0, _cars(observation))
+    cars = _cars(observation)
+    relative = reward.in_frames(symbols[0], symbols[1], cars)
+    inputs = reward.StageInputs(lane, width, symbols[2], symbols[3], 0.0, *relative, cars[5, :].T)
     state = (symbols[0], symbols[1], 0.0, 0.0)
     terms = reward.terms(state, (0.0, 0.0), inputs, observation.ego_size[1])
     weighted = [getattr(settings.reward, name) * terms[name] for name in PLACES]
@@ -62,7 +64,7 @@ def reward_landscape(
 
 
 def _cars(observation: Observation) -> ca.DM:
-    """Columns as in reward.StageInputs; without any car, one that is far away."""
+    """Columns as in reward.in_frames; without any car, one that is far away."""
     s, d, heading, _ = observation.states.T
     half_length, half_width = ((observation.sizes + observation.ego_size) / 2).T
     cars = np.array((s, d, np.cos(heading), np.sin(heading), half_length, half_width))

@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache, partial
-from math import isfinite
 from typing import Protocol
 
 import numpy as np
@@ -16,11 +15,11 @@ import numpy as np
 from sumo_cohesion.planning import dynamics
 from sumo_cohesion.planning.dynamics import DT
 from sumo_cohesion.planning.ilqr import Ilqr
+from sumo_cohesion.planning.instance import shared_desk
 from sumo_cohesion.planning.lbfgs import Lbfgs
 from sumo_cohesion.planning.nlp import InteriorPoint
 from sumo_cohesion.planning.problem import Guess, Instance, Problem, Solution
 from sumo_cohesion.planning.settings import PlannerSettings
-from sumo_cohesion.planning.stage import CONTROL_SCALE, StageParameters, make_instance
 from sumo_cohesion.state import RESCUED
 
 
@@ -42,10 +41,6 @@ SOLVERS: dict[str, Callable[[PlannerSettings, int], Solver]] = {
 }
 
 
-_HAIR = 1e-3
-"""How far a solution may be from what it should be, in scaled controls and in SI units."""
-
-
 @lru_cache(maxsize=32)
 def shared_solver(name: str, settings: PlannerSettings, n_lanes: int) -> Solver:
     """Return a solver, built once per process: it remembers nothing between two solves."""
@@ -65,8 +60,7 @@ class Mpc:
         self.settings = settings
         self.n_lanes = n_lanes
         self.solver = shared_solver(settings.solver, settings, n_lanes)
-        self._parameters = StageParameters(settings, n_lanes)
-        self._stages = np.zeros((settings.horizon, self._parameters.size))
+        self._desk = shared_desk(settings, n_lanes)
         self._warm: Guess | None = None
         self._rest: Guess | None = None
 
@@ -91,18 +85,18 @@ class Mpc:
     def solve(self, problem: Problem) -> Solution:
         """Solve one instance; never raises for a solver's failure, see ``solved``."""
         self._keep_rest()
-        self._parameters.fill(problem, self._stages)
-        if not isfinite(self._stages.sum() + problem.ego.sum()):
+        instance = self._desk.write(problem)
+        if instance is None:
             # Some solvers never return from a problem that is not a number.
             return _failed("input is not finite")
-        instance = make_instance(problem, self._stages, self.settings)
         guess = self._warm or self._hold(problem)
-        solution = self._attempt(self.solver, problem, instance, guess)
+        solution = self._attempt(self.solver, instance, guess)
         if not solution.solved:
-            solution = self._rescued(problem, instance, self._hold(problem), solution)
+            solution = self._rescued(instance, self._hold(problem), solution)
         if solution.solved:
             self._rest = Guess(solution.states, solution.controls)
-            self._warm = self._shifted(solution, float(problem.road_curvature[-1]))
+            last_bend = float(problem.road.rows[-2, -1])
+            self._warm = shifted(self._rest, self.settings.friction, last_bend)
         else:
             self._warm = None
         return solution
@@ -113,9 +107,7 @@ class Mpc:
         enough = rest is not None and 2 * (len(rest.controls) - 1) > self.settings.horizon
         self._rest = Guess(rest.states[1:], rest.controls[1:]) if rest and enough else None
 
-    def _attempt(
-        self, solver: Solver, problem: Problem, instance: Instance, guess: Guess
-    ) -> Solution:
+    def _attempt(self, solver: Solver, instance: Instance, guess: Guess) -> Solution:
         """Let a solver try; whatever goes wrong in it is a solution that is not ``solved``."""
         try:
             solution = solver.solve(instance, guess)
@@ -123,32 +115,14 @@ class Mpc:
             raise  # nothing else would work either
         except Exception as error:
             return _failed(f"{solver.name} raised {type(error).__name__}: {error}")
-        if solution.solved and not self._is_solution(solution, problem, instance):
+        if solution.solved and not self._desk.is_solution(solution):
             return _failed(f"{solver.name} returned garbage", solution)
         return solution
 
-    def _is_solution(self, solution: Solution, problem: Problem, instance: Instance) -> bool:
-        """Tell if all is finite and within bounds, and the first control leads where it says."""
-        states, controls = solution.states, solution.controls
-        horizon, friction = self.settings.horizon, self.settings.friction
-        if states.shape != (horizon + 1, 4) or controls.shape != (horizon, 2):
-            return False
-        if not isfinite(states.sum() + controls.sum()):
-            return False
-        scaled = controls / CONTROL_SCALE
-        if (np.minimum(scaled - instance.low, instance.high - scaled) < -_HAIR).any():
-            return False
-        start, bend = problem.ego.tolist(), float(problem.road_curvature[0])
-        reached = dynamics.step(start, controls[0].tolist(), DT, friction, bend)
-        claimed = states[:2].ravel().tolist()
-        return all(abs(a - b) < _HAIR for a, b in zip((*start, *reached), claimed, strict=True))
-
-    def _rescued(
-        self, problem: Problem, instance: Instance, guess: Guess, failed: Solution
-    ) -> Solution:
+    def _rescued(self, instance: Instance, guess: Guess, failed: Solution) -> Solution:
         """Try IPOPT, slower and sturdier."""
         ipopt = shared_solver("ipopt", self.settings, self.n_lanes)
-        second = self._attempt(ipopt, problem, instance, guess)
+        second = self._attempt(ipopt, instance, guess)
         return replace(
             second,
             status=RESCUED if second.solved else f"{failed.status}; {second.status}",
@@ -158,25 +132,24 @@ class Mpc:
 
     def _hold(self, problem: Problem) -> Guess:
         """Guess that keeps speed and heading along the road."""
-        state = tuple(float(v) for v in problem.ego)
+        state: tuple[float, ...] = problem.ego
         states, controls = [state], []
-        for t in range(self.settings.horizon):
-            curvature = float(problem.road_curvature[t])
+        for curvature in problem.road.rows[:-1, -1].tolist():
             control = (curvature, self.settings.friction * state[3])
             state = dynamics.step(state, control, DT, self.settings.friction, curvature)
             states.append(state)
             controls.append(control)
         return Guess(np.array(states), np.array(controls))
 
-    def _shifted(self, solution: Solution, road_curvature: float) -> Guess:
-        """Shift a solution by one step in time: the last control is held."""
-        states, controls = solution.states, solution.controls
-        final, held = states[-1].tolist(), controls[-1].tolist()
-        last = dynamics.step(final, held, DT, self.settings.friction, road_curvature)
-        return Guess(
-            np.concatenate((states[1:], np.array(last)[None])),
-            np.concatenate((controls[1:], controls[-1:])),
-        )
+
+def shifted(plan: Guess, friction: float, road_curvature: float) -> Guess:
+    """Shift a plan by one step in time: the last control is held, in a bend (1/m)."""
+    states, controls = np.empty_like(plan.states), np.empty_like(plan.controls)
+    states[:-1], controls[:-1] = plan.states[1:], plan.controls[1:]
+    final, held = plan.states[-1].tolist(), plan.controls[-1].tolist()
+    states[-1] = dynamics.step(final, held, DT, friction, road_curvature)
+    controls[-1] = held
+    return Guess(states, controls)
 
 
 def _failed(status: str, what: Solution | None = None) -> Solution:

@@ -20,7 +20,7 @@ from sumo_cohesion.errors import UserError
 from sumo_cohesion.perception.history import History
 from sumo_cohesion.planning.dynamics import DT
 from sumo_cohesion.planning.fallback import fallback
-from sumo_cohesion.planning.problem import FAR_AWAY, Problem, Solution
+from sumo_cohesion.planning.problem import Problem, Solution
 from sumo_cohesion.planning.safety import checked
 from sumo_cohesion.planning.settings import PlannerSettings
 from sumo_cohesion.road import Road
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from sumo_cohesion.planning.mpc import Mpc
 
 
-_NO_CAR = np.array((FAR_AWAY, 0.0, 1.0, 0.0, 1.0, 1.0))[:, None, None]
+_NOTHING = (0.0,) * len(FEATURES)
 
 
 @runtime_checkable
@@ -71,12 +71,10 @@ class CohesivePlanner:
     def __init__(self, settings: PlannerSettings, cohesion: CohesionSettings) -> None:
         self.settings = settings
         self.cohesion = cohesion
-        self._theta = np.array(list(settings.reward.model_dump().values()))
         self._election = Election(cohesion)
         self._mpc: Mpc | None = None
         self._driven: Control | None = None
-        self._nothing = np.zeros((len(FEATURES), settings.horizon))
-        self._ahead = DT * np.arange(1, settings.horizon + 1)
+        self._no_place = np.zeros(settings.horizon)
         # Where the horizon is asked for the others' place: every third step is dense enough.
         self._place_steps = list(range(1, settings.horizon + 1, 3))
 
@@ -144,38 +142,30 @@ class CohesivePlanner:
         horizon, ego = self.settings.horizon, observation.ego
         # Where the ego will be if it keeps its speed: the road is looked up there.
         pace = DT * ego.speed
-        ahead = self._road.ahead([ego.s + pace * t for t in range(horizon + 1)], ego.d)
-        weight, target, pressure = self._nothing, self._nothing, 0.0
+        weight, target, transitions, pressure = _NOTHING, _NOTHING, 0, 0.0
         if groups:
             # The paper's cohesion is on the first transition.
-            n = 1 if self.cohesion.transitions == "first" else horizon
+            transitions = 1 if self.cohesion.transitions == "first" else horizon
             term = combine(groups)
-            rows = np.array((term.weight, term.target))[:, :, None]
-            rows[0] *= self.cohesion.beta
-            weight, target = self._nothing.copy(), self._nothing.copy()
-            weight[:, :n], target[:, :n] = rows
-            pressure = n * self.cohesion.beta * sum(term.weight)
-        place_weight, place_target = self._nothing[0], self._nothing[0]
+            weight = tuple([self.cohesion.beta * w for w in term.weight])
+            target = term.target
+            pressure = transitions * self.cohesion.beta * sum(term.weight)
+        place_weight, place_target = self._no_place, self._no_place
         if any(place.weight):
             place_weight, place_target = self._place(place)
             pressure += float(place_weight.sum()) * PLACE_SCALE**2
         return Problem(
-            ego=np.array(ego),
-            ego_width=np.array([observation.ego_size[1]]),
-            road_curvature=ahead.curvature[:-1],
-            lanes=np.minimum(ahead.lanes[:, 1:], FAR_AWAY),
-            lane_widths=ahead.widths[:, 1:],
-            right=ahead.right[1:],
-            left=ahead.left[1:],
-            speed_limit=ahead.speed_limit[1:],
-            cars=self._predict_cars(observation),
-            theta=self._theta,
+            ego=ego,
+            ego_size=observation.ego_size,
+            road=self._road.ahead([ego.s + pace * t for t in range(horizon + 1)], ego.d),
+            cars=nearest_cars(observation, self.settings.cars),
             cohesion_weight=weight,
             cohesion_target=target,
+            transitions=transitions,
             place_weight=place_weight,
             place_target=place_target,
             # The more, the more cohesion could win by coming too close.
-            constraint_weight=np.array([self.settings.constraint * (1.0 + pressure)]),
+            constraint_weight=self.settings.constraint * (1.0 + pressure),
             driven=driven,
         )
 
@@ -187,31 +177,6 @@ class CohesivePlanner:
         weight = np.interp(stages, steps, asked) * (self.cohesion.beta / PLACE_SCALE**2)
         # Between a known place and an unknown one the known one counts, ever less.
         return weight, np.interp(stages, steps[known], np.array(place.mean)[known])
-
-    def _predict_cars(self, observation: Observation) -> FloatArray:
-        """Predict the nearest cars at constant velocity: (6, N, T), see reward.StageInputs."""
-        n, (ego_s, ego_d, _, _) = self.settings.cars, observation.ego
-        cars = np.empty((6, n, self.settings.horizon))
-        states, m = observation.states.tolist(), min(len(observation.ids), n)
-        cars[:, m:] = _NO_CAR
-        if not m:
-            return cars
-        # Numbers, not arrays, for so few.
-        distance = [(s - ego_s) ** 2 + (d - ego_d) ** 2 for s, d, _, _ in states]
-        nearest = sorted(range(len(states)), key=distance.__getitem__)[:n]
-        length, width = observation.ego_size
-        rows, velocities = [], []
-        for i in nearest:
-            s, d, heading, speed = states[i]
-            along, across = cos(heading), sin(heading)
-            other_length, other_width = observation.sizes[i].tolist()
-            half_sizes = 0.5 * (length + other_length), 0.5 * (width + other_width)
-            rows.append((s, d, along, across, *half_sizes))
-            stretch = 1.0 - float(observation.curvature[i]) * d
-            velocities.append((speed * along / stretch, speed * across))
-        cars[:, :m] = np.array(rows).T[:, :, None]
-        cars[:2, :m] += np.array(velocities).T[:, :, None] * self._ahead
-        return cars
 
     def _to_plan(
         self,
@@ -243,6 +208,17 @@ class CohesivePlanner:
             reward=solution.reward,
             agreement=rows,
         )
+
+
+def nearest_cars(observation: Observation, n: int) -> FloatArray:
+    """Return the up to n cars nearest to the ego, nearest first: rows as in Problem.cars."""
+    offset = observation.states[:, :2] - observation.ego[:2]
+    nearest = (offset * offset).sum(axis=1).argsort(kind="stable")[:n]
+    cars = np.empty((len(nearest), 7))
+    cars[:, :4] = observation.states.take(nearest, axis=0)
+    cars[:, 4:6] = observation.sizes.take(nearest, axis=0)
+    cars[:, 6] = observation.curvature.take(nearest)
+    return cars
 
 
 def _controls(rows: FloatArray) -> tuple[Control, ...]:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from sumo_cohesion.state import Control, FloatArray
+from sumo_cohesion.road import RoadAhead
+from sumo_cohesion.state import Control, FloatArray, RoadState
 
 FAR_AWAY = 1e4
 """Metres at which lanes and cars that do not exist are put: their Gaussians are zero there."""
@@ -12,40 +13,33 @@ FAR_AWAY = 1e4
 
 @dataclass(frozen=True)
 class Problem:
-    """One instance: what changes from step to step. T stages, L lanes, N cars, k features.
+    """One instance: what changes from step to step. T stages, k features.
 
     Attributes
     ----------
-    ego : (4,) road state.
-    ego_width : (1,) m.
-    road_curvature : (T,) of the reference line (1/m) at the start of each stage.
-    lanes, lane_widths : (L, T) m, at the end of each stage.
-    right, left : (T,) m, edges of the drivable strip.
-    speed_limit : (T,) m/s.
-    cars : (6, N, T), see reward.StageInputs.
-    theta : (6,) weights of the reward terms.
-    cohesion_weight, cohesion_target : (k, T), beta included; zero weights: not cohesive.
+    ego : road state.
+    ego_size : length, width (m).
+    road : the road at the ego, and at the end of each of the T stages if it keeps its speed.
+    cars : (n, 7) the nearest others, of which the settings' number count: s, d (m), heading (rad),
+        speed (m/s), length, width (m), curvature of the reference line beside it (1/m).
+    cohesion_weight, cohesion_target : k each, beta included; zero weights: not cohesive.
+    transitions : on how many of the stages, from the first, cohesion acts.
     place_weight, place_target : (T,) per m², beta included, and m: where across the road.
-    constraint_weight : (1,) per m beyond a constraint.
+    constraint_weight : per m beyond a constraint.
     driven : the control of the step before, from which this one's may differ by so much; None if
         there is none to differ from.
     """
 
-    ego: FloatArray
-    ego_width: FloatArray
-    road_curvature: FloatArray
-    lanes: FloatArray
-    lane_widths: FloatArray
-    right: FloatArray
-    left: FloatArray
-    speed_limit: FloatArray
+    ego: RoadState
+    ego_size: tuple[float, float]
+    road: RoadAhead
     cars: FloatArray
-    theta: FloatArray
-    cohesion_weight: FloatArray
-    cohesion_target: FloatArray
+    cohesion_weight: tuple[float, ...]
+    cohesion_target: tuple[float, ...]
+    transitions: int
     place_weight: FloatArray
     place_target: FloatArray
-    constraint_weight: FloatArray
+    constraint_weight: float
     driven: Control | None = None
 
 

@@ -26,8 +26,9 @@ class StageInputs(NamedTuple):
     lanes, lane_widths : (L, 1) m; a lane that does not exist has a centre far away.
     right, left : m, the road's edges.
     speed_limit : m/s.
-    cars : (6, N) s, d (m), cos and sin of the heading, half lengths and half widths of both
-        cars added (m).
+    along, across : (N, 1) place relative to every car, in its own frame, in half_lengths and
+        half_widths (`in_frames`).
+    half_widths : (N, 1) m, half widths of both cars added.
     """
 
     lanes: Any
@@ -35,7 +36,20 @@ class StageInputs(NamedTuple):
     right: Any
     left: Any
     speed_limit: Any
-    cars: Any
+    along: Any
+    across: Any
+    half_widths: Any
+
+
+def in_frames(s: Any, d: Any, cars: Any) -> tuple[Any, Any]:
+    """Place (s, d) (m) in every car's own frame, in half sizes: along and across, (N, 1) each.
+
+    ``cars`` is (6, N): s, d (m), cos and sin of the heading, half lengths and half widths of both
+    cars added (m).
+    """
+    ds, dd = s - cars[0, :], d - cars[1, :]
+    cos, sin, half_length, half_width = cars[2, :], cars[3, :], cars[4, :], cars[5, :]
+    return ((ds * cos + dd * sin) / half_length).T, ((dd * cos - ds * sin) / half_width).T
 
 
 def terms(state: Any, control: Any, inputs: StageInputs, ego_width: Any) -> dict[str, Any]:
@@ -49,7 +63,7 @@ def terms(state: Any, control: Any, inputs: StageInputs, ego_width: Any) -> dict
         "edge": -(ca.fmax(right, 0) ** 2 + ca.fmax(left, 0) ** 2),
         "speed": -((state[3] - inputs.speed_limit) ** 2),
         # One oriented Gaussian per car, as long and as wide as the two cars together.
-        "car": -ca.sum1(ca.exp(-0.5 * _cars(state, inputs.cars))),
+        "car": -ca.sum1(ca.exp(-0.5 * _cars(inputs))),
         "curvature": -(control[0] ** 2),
         "acceleration": -(control[1] ** 2),
     }
@@ -65,7 +79,7 @@ def squares(
     """
     right, left = _beyond_edges(state[1], inputs, ego_width)
     lanes = _lanes(state[1], inputs)
-    near = ca.exp(-0.25 * _cars(state, inputs.cars))
+    near = ca.exp(-0.25 * _cars(inputs))
     return {
         "lane": [(lanes, ca.exp(-0.5 * lanes**2))],
         "edge": [(right, 2.0 * (right > 0)), (left, 2.0 * (left > 0))],
@@ -87,10 +101,6 @@ def _beyond_edges(d: Any, inputs: StageInputs, ego_width: Any) -> tuple[Any, Any
     return inputs.right + reach - d, d + reach - inputs.left
 
 
-def _cars(state: Any, cars: Any) -> Any:
+def _cars(inputs: StageInputs) -> Any:
     """Squared distance to every car, in its half length along and CAR_SIGMA_LATERAL across."""
-    ds, dd = state[0] - cars[0, :], state[1] - cars[1, :]
-    cos, sin, half_length, half_width = cars[2, :], cars[3, :], cars[4, :], cars[5, :]
-    along = (ds * cos + dd * sin) / half_length
-    across = (dd * cos - ds * sin) / (CAR_SIGMA_LATERAL * half_width)
-    return (along**2 + across**2).T
+    return inputs.along**2 + (inputs.across / CAR_SIGMA_LATERAL) ** 2

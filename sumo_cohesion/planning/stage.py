@@ -6,7 +6,6 @@ A stage goes from one state to the next. Its reward is the ego's own, at the sta
 
 from __future__ import annotations
 
-from functools import lru_cache
 from typing import Any, NamedTuple
 
 import casadi as ca
@@ -14,10 +13,8 @@ import numpy as np
 
 from sumo_cohesion.planning import constraints, dynamics, reward
 from sumo_cohesion.planning.dynamics import DT
-from sumo_cohesion.planning.problem import Instance, Problem
 from sumo_cohesion.planning.settings import PlannerSettings, RewardWeights
 from sumo_cohesion.social.features import FEATURES, social_features
-from sumo_cohesion.state import FloatArray
 
 SCALES = (0.01, 5.0)
 """Curvature (1/m) and acceleration (m/s²) that solvers see as one."""
@@ -33,8 +30,9 @@ class Stage(NamedTuple):
     """Expressions of one stage in ``state`` (6), ``control`` (2, scaled) and ``parameters``.
 
     The state is the road state and the scaled control of the stage before. ``next_state`` is where
-    the control leads. The terms are written in a symbol ``landing`` (4) that stands for the road
-    state there: their derivatives are cheap in it, and dear in what leads there.
+    the control leads. The terms are written in two symbols, in which derivatives are cheap, and
+    dear in what leads there: ``landing`` (4) stands for the road state there, and ``relative``
+    (2 N) for its place in the other cars' frames, which is ``relative_there`` of the landing.
 
     ``residuals`` r and ``residual_weights`` w say the same cost as a weighted sum of squares, in
     the sense that its gradient is J'(w r) and J' diag(w) J is positive semidefinite: what a
@@ -46,6 +44,8 @@ class Stage(NamedTuple):
     parameters: Any
     next_state: Any
     landing: Any
+    relative: Any
+    relative_there: Any
     terms: dict[str, Any]
     residuals: Any
     residual_weights: Any
@@ -56,34 +56,20 @@ class Stage(NamedTuple):
         return -sum(self.terms.values())
 
     def landed(self, *expressions: Any) -> list[Any]:
-        """Put the road state where the control leads in the place of ``landing``."""
-        where = [self.next_state[:4]]
-        return list(ca.substitute(list(expressions), [self.landing], where))
+        """Put where the control leads in the place of ``relative`` and ``landing``."""
+        near = ca.substitute(list(expressions), [self.relative], [self.relative_there])
+        return list(ca.substitute(near, [self.landing], [self.next_state[:4]]))
 
     def inputs(self) -> list[Any]:
         """State, control and parameters, of which everything is a function."""
         return [self.state, self.control, self.parameters]
 
 
-_PER_STAGE = (
-    "road_curvature",
-    "lanes",
-    "lane_widths",
-    "right",
-    "left",
-    "speed_limit",
-    "cohesion_weight",
-    "cohesion_target",
-    "place_weight",
-    "place_target",
-)
-
-
 class StageParameters:
-    """Where each part of a Problem lies in a stage's parameter vector."""
+    """The parts of a stage's parameter vector, in order, and their sizes."""
 
     def __init__(self, settings: PlannerSettings, n_lanes: int) -> None:
-        k, self.n_cars = len(FEATURES), settings.cars
+        k, self.n_cars, self.n_lanes = len(FEATURES), settings.cars, n_lanes
         self.sizes = {
             "ego_width": 1,
             "theta": len(RewardWeights.model_fields),
@@ -101,23 +87,10 @@ class StageParameters:
             "constraint_weight": 1,
         }
         self.size = sum(self.sizes.values())
-        ends = np.cumsum(list(self.sizes.values())).tolist()
-        starts = [0, *ends[:-1]]
-        self._places = dict(zip(self.sizes, map(slice, starts, ends), strict=True))
 
     def symbols(self) -> dict[str, Any]:
         """Return one symbol per part."""
         return {name: ca.SX.sym(name, size) for name, size in self.sizes.items()}
-
-    def fill(self, problem: Problem, out: FloatArray) -> None:
-        """Write a problem's parameters: ``out`` is (T, size), one row per stage."""
-        columns, places = out.T, self._places
-        for name in ("ego_width", "theta", "constraint_weight"):  # the same at all stages
-            columns[places[name]] = getattr(problem, name)[:, None]
-        for name in _PER_STAGE:
-            columns[places[name]] = getattr(problem, name)
-        cars = problem.cars.transpose(1, 0, 2)
-        columns[places["cars"]] = cars.reshape(self.sizes["cars"], -1)
 
 
 def make_stage(settings: PlannerSettings, parameters: StageParameters) -> Stage:
@@ -129,13 +102,18 @@ def make_stage(settings: PlannerSettings, parameters: StageParameters) -> Stage:
     reached = dynamics.step(before, physical, DT, settings.friction, p["road_curvature"])
     landing = ca.SX.sym("landing", 4)
     after = ca.vertsplit(landing)
+    cars = ca.reshape(p["cars"], 6, parameters.n_cars)
+    relative = ca.SX.sym("relative", 2 * parameters.n_cars)
+    along, across = ca.vertsplit(relative, parameters.n_cars)
     inputs = reward.StageInputs(
         lanes=p["lanes"],
         lane_widths=p["lane_widths"],
         right=p["right"],
         left=p["left"],
         speed_limit=p["speed_limit"],
-        cars=ca.reshape(p["cars"], 6, parameters.n_cars),
+        along=along,
+        across=across,
+        half_widths=cars[5, :].T,
     )
     # Original reward, eq. 1.
     own = reward.terms(after, physical, inputs, p["ego_width"])
@@ -158,58 +136,12 @@ def make_stage(settings: PlannerSettings, parameters: StageParameters) -> Stage:
         ca.vertcat(*p.values()),
         ca.vertcat(*reached, control),
         landing,
+        relative,
+        ca.vertcat(*reward.in_frames(after[0], after[1], cars)),
         terms,
         ca.vertcat(*residuals),
         ca.vertcat(*weights),
     )
-
-
-def make_instance(problem: Problem, stages: FloatArray, settings: PlannerSettings) -> Instance:
-    """Put a problem into the solvers' numbers; ``stages`` are its filled parameters."""
-    low, high = control_bounds(settings, float(problem.ego[3]))
-    start, change = np.zeros(N_STATES), _largest_change(settings)
-    start[:4] = problem.ego
-    if problem.driven is None:
-        change = change.copy()
-        change[0] = UNLIMITED
-        return Instance(start, stages, low, high, change)
-    # What was driven under other bounds, at another speed, must not leave nothing to choose.
-    bounds = zip(problem.driven, SCALES, low[0].tolist(), high[0].tolist(), strict=True)
-    start[4:] = [min(max(value / scale, least), most) for value, scale, least, most in bounds]
-    return Instance(start, stages, low, high, change)
-
-
-@lru_cache(maxsize=32)
-def _largest_change(settings: PlannerSettings) -> FloatArray:
-    per_step = (DT * settings.max_curvature_rate / SCALES[0], DT * settings.max_jerk / SCALES[1])
-    change = np.tile(per_step, (settings.horizon, 1))
-    change.setflags(write=False)  # everybody's
-    return change
-
-
-def control_bounds(settings: PlannerSettings, speed: float) -> tuple[FloatArray, FloatArray]:
-    """Lowest and highest scaled controls of every stage, (T, 2) each, from a speed (m/s).
-
-    Braking and acceleration are bounded as what they do to the speed, friction included. Curvature
-    is bounded so that the lateral acceleration keeps to its bound however fast the ego may be by
-    then.
-    """
-    gain, drag, horizon = (
-        DT * settings.max_acceleration,
-        settings.friction * speed,
-        settings.horizon,
-    )
-    low, high = np.empty((horizon, 2)), np.empty((horizon, 2))
-    if settings.sharpest(speed + gain * horizon) == settings.max_curvature:
-        high[:, 0] = settings.max_curvature / SCALES[0]
-    else:
-        high[:, 0] = [
-            settings.sharpest(speed + gain * t) / SCALES[0] for t in range(1, horizon + 1)
-        ]
-    low[:, 0] = -high[:, 0]
-    low[:, 1] = (drag - settings.max_braking) / SCALES[1]
-    high[:, 1] = (drag + settings.max_acceleration) / SCALES[1]
-    return low, high
 
 
 def standstill(state: Any, settings: PlannerSettings) -> Any:

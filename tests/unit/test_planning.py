@@ -12,14 +12,14 @@ from sumo_cohesion.errors import UserError
 from sumo_cohesion.perception.history import History
 from sumo_cohesion.planning import dynamics
 from sumo_cohesion.planning.fallback import fallback
-from sumo_cohesion.planning.mpc import Mpc
+from sumo_cohesion.planning.mpc import shifted
 from sumo_cohesion.planning.planners import (
     CohesivePlanner,
     Planner,
     SumoDriver,
     make_planner,
 )
-from sumo_cohesion.planning.problem import Problem, Solution
+from sumo_cohesion.planning.problem import Guess
 from sumo_cohesion.planning.settings import PlannerSettings
 from sumo_cohesion.road import Road
 from sumo_cohesion.social.memory import new_history
@@ -209,14 +209,14 @@ def test_beta_zero_is_the_nominal_planner(highway: Road) -> None:
     assert a.agreement == ()
 
 
-def test_warm_start_shifts_time_not_controls(highway: Road) -> None:
-    mpc = Mpc(SETTINGS, 3)
+def test_warm_start_shifts_time_not_controls() -> None:
     t = SETTINGS.horizon
     states = np.arange(4.0 * (t + 1)).reshape(t + 1, 4)
     controls = np.column_stack((np.arange(float(t)), 10.0 + np.arange(float(t))))
-    shifted = mpc._shifted(Solution(states, controls, True, "solved", 1, 0.0, {}), 0.0)
-    u = shifted.controls
-    assert np.array_equal(shifted.states[:-1], states[1:])
+    guess = shifted(Guess(states, controls), 0.1, 0.0)
+    u = guess.controls
+    assert np.array_equal(guess.states[:-1], states[1:])
+    assert guess.states[-1].tolist() == list(dynamics.step(states[-1], controls[-1], 0.1, 0.1))
     assert u[:, 0] == pytest.approx([*range(1, t), t - 1])
     assert u[:, 1] == pytest.approx([*range(11, 10 + t), 9 + t])
 
@@ -227,7 +227,7 @@ def test_a_problem_that_is_not_a_number_is_refused(highway: Road) -> None:
     scene = observation((100.0, 0.0, 0.0, 25.0), [])
     problem = planner._problem(scene, (), NOWHERE, None)
     assert planner._mpc is not None
-    broken: Problem = replace(problem, ego=np.array([np.nan, 0.0, 0.0, 25.0]))
+    broken = replace(problem, ego=RoadState(np.nan, 0.0, 0.0, 25.0))
     solution = planner._mpc.solve(broken)
     assert not solution.solved
     assert solution.status == "input is not finite"

@@ -135,11 +135,29 @@ def test_ahead_keeps_to_the_routes_own_branch_where_a_lane_splits(way: str) -> N
     own = route[np.arange(len(places)), np.nanargmin(np.abs(route - right_lane), axis=1)]
     assert np.abs(own - right_lane).max() < 0.3
     # The edges are those of its own branch, and leave room for it.
-    assert (ahead.right < own - 1.7).all()
-    assert (ahead.left > own + 1.7).all()
-    at_end = ahead.left[-1] - ahead.right[-1]
+    right, left = ahead.edges.T
+    assert (right < own - 1.7).all()
+    assert (left > own + 1.7).all()
+    at_end = left[-1] - right[-1]
     assert at_end == pytest.approx(3.5 if way == "ramp" else 10.5, abs=0.1)
     # Between the two there is no lane: the other counts from half a lane's width on.
-    off = np.abs(ahead.lanes[road.n_route_lanes :] - own)
-    assert off.min() >= 1.7
-    assert np.isfinite(ahead.lanes[road.n_route_lanes :]).any()
+    others = ahead.rows[:, road.n_route_lanes : road.lane_centre.shape[1]]
+    assert np.abs(others - own[:, None]).min() >= 1.7
+    assert np.isfinite(others).any()
+
+
+@pytest.mark.parametrize("d", [-4.0, 0.0, 4.0])
+def test_ahead_is_the_same_with_and_without_the_short_cut(d: float) -> None:
+    """Where nothing changes one look is enough: on every stretch as on a stretch of one place."""
+    road = Network(ROOT / "networks" / "exit.net.xml").road(("before", "after"))
+    middle = float(np.nanmean(road.lanes_at(900.0)))
+    for start in np.arange(0.0, road.length, 37.0):
+        places = (start + np.arange(0.0, 30.0, 3.0)).tolist()
+        whole = road.ahead(places, middle + d)
+        looked_up, followed = [], middle + d
+        for place in places:
+            one = road.ahead([place], followed)
+            lanes = one.rows[0, : road.lane_centre.shape[1]]
+            followed = lanes[np.abs(lanes - followed).argmin()]
+            looked_up.append(np.concatenate((one.rows[0], one.edges[0])))
+        assert np.array_equal(np.hstack((whole.rows, whole.edges)), looked_up)

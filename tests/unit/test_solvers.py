@@ -18,53 +18,48 @@ from hypothesis import strategies as st
 from sumo_cohesion.planning import compiled as compilation
 from sumo_cohesion.planning.dynamics import step
 from sumo_cohesion.planning.ilqr import _box_step
+from sumo_cohesion.planning.instance import Desk
 from sumo_cohesion.planning.mpc import SOLVERS, Mpc
 from sumo_cohesion.planning.problem import FAR_AWAY, Problem, Solution
 from sumo_cohesion.planning.settings import PlannerSettings
-from sumo_cohesion.planning.stage import (
-    CONTROL_SCALE,
-    StageParameters,
-    control_bounds,
-    make_stage,
-)
-from sumo_cohesion.state import Control
+from sumo_cohesion.planning.stage import UNLIMITED, StageParameters, make_stage
+from sumo_cohesion.road import RoadAhead
+from sumo_cohesion.state import Control, RoadState
 from tests.conftest import ROOT
 
 SETTINGS = PlannerSettings()
 LANES = np.array([-3.5, 0.0, 3.5])
 
 
+def straight_road(horizon: int, curvature: float = 0.0, limit: float = 25.0) -> RoadAhead:
+    """Three lanes, with one curvature and speed limit all along."""
+    row = (*LANES, 3.5, 3.5, 3.5, limit, curvature)
+    return RoadAhead(np.tile(row, (horizon + 1, 1)), np.tile((-5.25, 5.25), (horizon + 1, 1)))
+
+
 def problem(seed: int, horizon: int = 10, cohesion: float = 1.0) -> Problem:
     """Make a random instance: a road, a few cars, something to follow."""
     rng = np.random.default_rng(seed)
     speed = rng.uniform(0.0, 35.0)
-    n, t = SETTINGS.cars, horizon
-    cars = np.zeros((6, n, t))
-    cars[0], cars[2], cars[4], cars[5] = FAR_AWAY, 1.0, 5.0, 1.8
-    for i in range(rng.integers(0, n + 1)):
-        ahead = 0.1 * np.arange(1, t + 1) * rng.uniform(0.0, 30.0)
-        cars[0, i] = 100.0 + rng.uniform(-60.0, 60.0) + ahead
-        cars[1, i] = rng.choice(LANES) + rng.normal(0.0, 0.5)
-    weight = np.zeros((5, t))
-    weight[:, 0] = cohesion * rng.uniform(0.0, 36.0, 5) * rng.integers(0, 2, 5)
-    target = np.zeros((5, t))
-    target[:, 0] = rng.normal(0.0, 0.3, 5) + np.array([0.0, speed / 10.0, 0.0, speed / 10.0, 0.0])
+    cars = []
+    for _ in range(rng.integers(0, SETTINGS.cars + 1)):
+        pace = rng.uniform(0.0, 30.0)
+        s = 100.0 + rng.uniform(-60.0, 60.0)
+        cars.append((s, rng.choice(LANES) + rng.normal(0.0, 0.5), 0.0, pace, 5.0, 1.8, 0.0))
+    weight = cohesion * rng.uniform(0.0, 36.0, 5) * rng.integers(0, 2, 5)
+    target = rng.normal(0.0, 0.3, 5) + np.array([0.0, speed / 10.0, 0.0, speed / 10.0, 0.0])
+    d, heading = rng.uniform(-4.0, 4.0), rng.normal(0.0, 0.05)
     return Problem(
-        ego=np.array([100.0, rng.uniform(-4.0, 4.0), rng.normal(0.0, 0.05), speed]),
-        ego_width=np.array([1.8]),
-        road_curvature=np.full(t, rng.uniform(-0.003, 0.003)),
-        lanes=np.tile(LANES[:, None], t),
-        lane_widths=np.full((3, t), 3.5),
-        right=np.full(t, -5.25),
-        left=np.full(t, 5.25),
-        speed_limit=np.full(t, 25.0),
-        cars=cars,
-        theta=np.array(list(SETTINGS.reward.model_dump().values())),
-        cohesion_weight=weight,
-        cohesion_target=target,
-        place_weight=np.full(t, cohesion * rng.uniform(0.0, 5.0)),
-        place_target=rng.uniform(-4.0, 4.0) + np.zeros(t),
-        constraint_weight=np.array([20.0 * (1.0 + weight.sum())]),
+        ego=RoadState(100.0, d, heading, speed),
+        ego_size=(5.0, 1.8),
+        road=straight_road(horizon, rng.uniform(-0.003, 0.003)),
+        cars=np.array(cars).reshape(-1, 7),
+        cohesion_weight=tuple(weight.tolist()),
+        cohesion_target=tuple(target.tolist()),
+        transitions=1,
+        place_weight=np.full(horizon, cohesion * rng.uniform(0.0, 5.0)),
+        place_target=np.full(horizon, rng.uniform(-4.0, 4.0)),
+        constraint_weight=20.0 * (1.0 + float(weight.sum())),
         driven=Control(rng.uniform(-0.01, 0.01), rng.uniform(-8.0, 4.8)) if seed % 2 else None,
     )
 
@@ -82,7 +77,7 @@ def test_all_solvers_agree_and_keep_their_promises(solvers: dict[str, Mpc], seed
         solution = mpc.solve(problem(seed))
         assert solution.status == "solved", name  # by itself: IPOPT has not had to help
         for t, control in enumerate(solution.controls):
-            curvature = float(problem(seed).road_curvature[t])
+            curvature = float(problem(seed).road.rows[t, -1])
             again = step(solution.states[t], control, 0.1, SETTINGS.friction, curvature)
             assert np.array(again) == pytest.approx(solution.states[t + 1], abs=1e-5)
         value[name] = sum(solution.reward.values())
@@ -104,17 +99,95 @@ def test_squares_have_the_gradient_of_the_cost_and_are_never_negative() -> None:
         [z, stage.parameters],
         [ca.gradient(cost, z), jacobian.T @ (weights * residuals), weights],
     )
+    desk = Desk(SETTINGS, 3)
     for seed in range(50):
-        instance = problem(seed)
-        rows = np.zeros((10, parameters.size))
-        parameters.fill(instance, rows)
+        asked = problem(seed)
+        instance = desk.write(asked)
+        assert instance is not None
         control = np.random.default_rng(seed).normal(size=4)
         exact, squares, weights = (
             np.asarray(value).ravel()
-            for value in function(np.concatenate((instance.ego, control)), rows[0])
+            for value in function(np.concatenate((asked.ego, control)), instance.stages[0])
         )
         assert squares == pytest.approx(exact, abs=1e-9 * (1.0 + np.abs(exact).max()))
         assert (weights >= 0.0).all()
+
+
+def part(rows: np.ndarray, name: str) -> np.ndarray:
+    """Columns of a stage's parameters, (T, size)."""
+    sizes = StageParameters(SETTINGS, 3).sizes
+    ends = dict(zip(sizes, np.cumsum(list(sizes.values())).tolist(), strict=True))
+    return rows[:, ends[name] - sizes[name] : ends[name]]
+
+
+def test_what_solvers_read_is_what_is_known() -> None:
+    desk, asked = Desk(SETTINGS, 3), problem(7)
+    car = (130.0, 3.0, 0.1, 20.0, 12.0, 2.4, 0.004)
+    road = straight_road(10)
+    road.rows[:, 0], road.rows[3:, -2], road.rows[:, -1] = np.inf, 30.0, 0.001 * np.arange(11)
+    asked = replace(asked, cars=np.array([car]), road=road, transitions=4)
+    instance = desk.write(asked)
+    assert instance is not None
+    rows, time = instance.stages, 0.1 * np.arange(1, 11)
+    cars = part(rows, "cars").reshape(10, SETTINGS.cars, 6)
+    along = 20.0 * np.cos(0.1) / (1.0 - 0.004 * 3.0)
+    assert cars[:, 0, 0] == pytest.approx(130.0 + along * time)
+    assert cars[:, 0, 1] == pytest.approx(3.0 + 20.0 * np.sin(0.1) * time)
+    assert cars[0, 0, 2:] == pytest.approx([np.cos(0.1), np.sin(0.1), 8.5, 2.1])
+    assert (cars[:, 1:, 0] == FAR_AWAY).all()
+    lanes = part(rows, "lanes")
+    assert (lanes[:, 0] == FAR_AWAY).all()
+    assert (lanes[:, 1:] == LANES[1:]).all()
+    # A stage is judged where it ends, and begins in the bend that is there.
+    assert part(rows, "speed_limit").ravel().tolist() == [25.0] * 2 + [30.0] * 8
+    assert part(rows, "road_curvature").ravel() == pytest.approx(0.001 * np.arange(10))
+    weights = part(rows, "cohesion_weight")
+    assert (weights[:4] == asked.cohesion_weight).all()
+    assert (weights[4:] == 0.0).all()
+    assert instance.start[:4].tolist() == list(asked.ego)
+
+
+def test_the_change_of_the_first_control_is_bounded_if_one_was_driven() -> None:
+    desk, asked = Desk(SETTINGS, 3), problem(7)
+    ego = RoadState(100.0, 0.0, 0.0, 20.0)
+    free = desk.write(replace(asked, ego=ego, driven=None))
+    assert free is not None
+    assert (free.change[0] == UNLIMITED).all()
+    assert (free.start[4:] == 0.0).all()
+    most = 0.1 * SETTINGS.max_curvature_rate / 0.01, 0.1 * SETTINGS.max_jerk / 5.0
+    assert free.change[1] == pytest.approx(most)
+    bound = desk.write(replace(asked, ego=ego, driven=Control(0.002, -50.0)))
+    assert bound is not None
+    assert bound.change[0] == pytest.approx(most)
+    # Braking harder than is allowed now would leave nothing to choose.
+    hardest = SETTINGS.friction * 20.0 - SETTINGS.max_braking
+    assert bound.start[4:] == pytest.approx([0.2, hardest / 5.0])
+
+
+def test_what_cannot_be_a_solution_is_found_out() -> None:
+    desk, asked = Desk(SETTINGS, 3), problem(7)
+    mpc = Mpc(SETTINGS, 3)
+    good = mpc.solve(asked)
+    assert desk.write(asked) is not None
+    assert desk.is_solution(good)
+    states, controls = good.states, good.controls
+    wrong = np.zeros_like(states)
+    for row in (0, 1):
+        for column in range(4):
+            wrong[:] = 0.0
+            wrong[row, column] = 0.002
+            assert not desk.is_solution(replace(good, states=states + wrong))
+    for value in (np.nan, np.inf, 0.02):
+        for row in (0, 9):
+            broken = controls.copy()
+            broken[row, 0] = value
+            assert not desk.is_solution(replace(good, controls=broken))
+    for value in (np.nan, np.inf, -np.inf):
+        broken = states.copy()
+        broken[7, 1] = value
+        assert not desk.is_solution(replace(good, states=broken))
+    assert not desk.is_solution(replace(good, states=states[:-1]))
+    assert not desk.is_solution(replace(good, controls=controls[:-1]))
 
 
 def test_the_box_problem_is_solved_exactly() -> None:
@@ -157,7 +230,7 @@ def test_bounds_hold_whatever_is_asked(
 ) -> None:
     instance = problem(seed, cohesion=cohesion)
     last = None if driven is None else Control(*driven)
-    instance = replace(instance, ego=np.array([100.0, d, heading, speed]), driven=last)
+    instance = replace(instance, ego=RoadState(100.0, d, heading, speed), driven=last)
     mpc = solvers["ilqr"]
     mpc.reset()
     solution = mpc.solve(instance)
@@ -170,7 +243,7 @@ def test_bounds_hold_whatever_is_asked(
 
 def hold_limits(solution: Solution, instance: Problem) -> None:
     """Assert that every control of a solution keeps to every limit, the interior point's hair."""
-    speed = float(instance.ego[3])
+    speed = instance.ego.speed
     curvature, acceleration = solution.controls.T
     assert np.abs(curvature).max() <= SETTINGS.max_curvature + 1e-9
     aside = np.abs(curvature) * solution.states[1:, 3] ** 2
@@ -182,8 +255,9 @@ def hold_limits(solution: Solution, instance: Problem) -> None:
     assert solution.states[:, 3].min() >= -1e-6  # what IPOPT, which rescues, calls zero
     before = curvature[:1], acceleration[:1]
     if instance.driven is not None:
-        low, high = control_bounds(SETTINGS, speed)
-        last = np.clip(np.array(instance.driven) / CONTROL_SCALE, low[0], high[0]) * CONTROL_SCALE
+        sharpest = SETTINGS.sharpest(speed + 0.1 * SETTINGS.max_acceleration)
+        low = -sharpest, drag - SETTINGS.max_braking
+        last = np.clip(instance.driven, low, (sharpest, drag + SETTINGS.max_acceleration))
         before = last[:1], last[1:]
     turned = np.abs(np.diff(np.concatenate((before[0], curvature))))
     assert turned.max() <= 0.1 * SETTINGS.max_curvature_rate + 1e-7
@@ -216,18 +290,17 @@ def test_tight_rates_bind_and_hold(name: str) -> None:
 def test_no_cohesion_buys_leaving_the_road(cohesion: float) -> None:
     mpc = Mpc(SETTINGS, 3)
     instance = problem(3, cohesion=cohesion)
-    weight = np.zeros((5, 10))
-    weight[[0, 2, 4], 0] = 36.0 * cohesion  # turn left, hard
+    pull = 36.0 * cohesion
     instance = replace(
         instance,
-        ego=np.array([100.0, 4.0, 0.0, 25.0]),
-        cars=problem(3).cars * 0.0 + np.array([FAR_AWAY, 0, 1, 0, 5, 1.8])[:, None, None],
-        cohesion_weight=weight,
-        cohesion_target=np.ones((5, 10)),
+        ego=RoadState(100.0, 4.0, 0.0, 25.0),
+        cars=np.zeros((0, 7)),
+        cohesion_weight=(pull, 0.0, pull, 0.0, pull),  # turn left, hard
+        cohesion_target=(1.0,) * 5,
         place_weight=np.full(10, cohesion),
         place_target=np.full(10, 8.0),
-        constraint_weight=np.array([20.0 * (1.0 + weight.sum() + 10.0 * cohesion * 3.5**2)]),
-        road_curvature=np.zeros(10),
+        constraint_weight=20.0 * (1.0 + 3.0 * pull + 10.0 * cohesion * 3.5**2),
+        road=straight_road(10),
         driven=None,
     )
     solution = mpc.solve(instance)
@@ -236,12 +309,13 @@ def test_no_cohesion_buys_leaving_the_road(cohesion: float) -> None:
 
 
 def test_a_car_that_has_to_stop_stops(solvers: dict[str, Mpc]) -> None:
-    ego = np.array([100.0, 0.0, 0.0, 2.0])
-    instance = replace(problem(0, cohesion=0.0), ego=ego, road_curvature=np.zeros(10))
-    cars = instance.cars.copy()
-    cars[0], cars[1] = FAR_AWAY, 0.0
-    cars[0, 0] = 106.5
-    instance = replace(instance, cars=cars, speed_limit=np.zeros(10), place_weight=np.zeros(10))
+    instance = replace(
+        problem(0, cohesion=0.0),
+        ego=RoadState(100.0, 0.0, 0.0, 2.0),
+        road=straight_road(10, limit=0.0),
+        cars=np.array([[106.5, 0.0, 0.0, 0.0, 5.0, 1.8, 0.0]]),
+        place_weight=np.zeros(10),
+    )
     speeds = {}
     for name in ("ilqr", "ipopt"):
         solvers[name].reset()
@@ -283,7 +357,7 @@ def test_compiled_or_not_the_plans_are_the_same_bit_for_bit(tmp_path: Path) -> N
         pytest.skip("no C compiler here")
     how, fast = plans(XDG_CACHE_HOME=str(tmp_path))
     assert how == "compiled"
-    assert len(list((tmp_path / "sumo-cohesion").glob("*.so"))) == 1
+    assert len(list((tmp_path / "sumo-cohesion").glob("*.so"))) == 2  # the solver, the desk
     how, slow = plans(SUMO_COHESION_COMPILE="0")
     assert how == "not compiled: SUMO_COHESION_COMPILE is 0"
     assert fast == slow
@@ -326,4 +400,4 @@ def test_many_processes_compile_once(tmp_path: Path) -> None:
     said = [process.communicate()[0] for process in processes]
     assert all(text.startswith("compiled") for text in said)
     assert len(set(said)) == 1
-    assert len(list((tmp_path / "sumo-cohesion").glob("*.so"))) == 1
+    assert len(list((tmp_path / "sumo-cohesion").glob("*.so"))) == 2  # the solver, the desk
