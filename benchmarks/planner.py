@@ -38,12 +38,12 @@ import pandas as pd
 from sumo_cohesion.experiments.rollout import versions
 from sumo_cohesion.experiments.setup import prepare
 from sumo_cohesion.experiments.simulation import simulate
-from sumo_cohesion.planning import dynamics
 from sumo_cohesion.planning import mpc as mpc_module
 from sumo_cohesion.planning.instance import Desk
 from sumo_cohesion.planning.mpc import Mpc, shifted
+from sumo_cohesion.planning.nlp import roll_out
 from sumo_cohesion.planning.planners import make_planner
-from sumo_cohesion.planning.problem import Guess, Instance, Problem, Solution
+from sumo_cohesion.planning.problem import Instance, Problem, Solution
 from sumo_cohesion.planning.settings import PlannerSettings
 from sumo_cohesion.planning.stage import (
     CONTROL_SCALE,
@@ -90,13 +90,19 @@ class Peer:
 
     def __init__(self, settings: PlannerSettings, n_lanes: int) -> None:
         self.settings = settings
-        stage = make_stage(settings, StageParameters(settings, n_lanes))
+        layout = StageParameters(settings, n_lanes)
+        stage = make_stage(settings, layout)
         self.step = ca.Function("step", stage.inputs(), [stage.next_state])
         self.cost = ca.Function("cost", stage.inputs(), stage.landed(stage.cost))
         most = ca.SX.sym("most", 2)
         excess = rate_excess(stage.state, stage.control, most, settings)
         self.rates = ca.Function("rates", [stage.state, stage.control, most], [excess])
         self.n_parameters = stage.parameters.shape[0]
+        self._bends = layout.columns("road_curvature")
+
+    def states(self, instance: Instance, guess: np.ndarray) -> np.ndarray:
+        """States that guessed controls lead to, (T + 1, 6)."""
+        return roll_out(instance, guess, self._bends, self.settings.friction)
 
 
 class DoMpc(Peer):
@@ -152,7 +158,7 @@ class DoMpc(Peer):
         self._x = np.array([at(whole["_x", k, 0, -1]) for k in range(t + 1)])
         self._template.master = 0.0
 
-    def solve(self, instance: Instance, guess: Guess) -> tuple[np.ndarray, bool]:
+    def solve(self, instance: Instance, guess: np.ndarray) -> tuple[np.ndarray, bool]:
         controller, last = (
             self._controller,
             np.minimum(np.arange(self.settings.horizon + 1), self.settings.horizon - 1),
@@ -172,11 +178,11 @@ class DoMpc(Peer):
             flat[self._u] = values
             bounds.master = ca.DM(flat)
         start = np.asarray(controller.opt_x_num.master).ravel().copy()
-        start[self._u] = guess.controls / CONTROL_SCALE
-        start[self._x] = with_controls(instance, guess)
+        start[self._u] = guess / CONTROL_SCALE
+        start[self._x] = self.states(instance, guess)
         controller.opt_x_num.master = ca.DM(start)
         controller.x0 = instance.start
-        controller.u0 = guess.controls[0] / CONTROL_SCALE
+        controller.u0 = guess[0] / CONTROL_SCALE
         controller.make_step(instance.start[:, None])
         controls = np.asarray(controller.opt_x_num.master).ravel()[self._u]
         return controls, bool(controller.solver_stats["success"])
@@ -220,20 +226,14 @@ class Rockit(Peer):
         given.append(ocp.value(start))
         self._function = ocp.to_function("solve", [*given, states, controls], [controls])
 
-    def solve(self, instance: Instance, guess: Guess) -> tuple[np.ndarray, bool]:
+    def solve(self, instance: Instance, guess: np.ndarray) -> tuple[np.ndarray, bool]:
         given = (instance.stages, instance.change, instance.low, instance.high)
-        start = (with_controls(instance, guess).T, (guess.controls / CONTROL_SCALE).T)
+        start = (self.states(instance, guess).T, (guess / CONTROL_SCALE).T)
         try:
             found = self._function(*[rows.T for rows in given], instance.start, *start)
         except RuntimeError:
             return np.full((self.settings.horizon, 2), np.nan), False
         return np.asarray(found).T, True
-
-
-def with_controls(instance: Instance, guess: Guess) -> np.ndarray:
-    """Return a guess of the whole states, (T + 1, 6)."""
-    controls = np.vstack((instance.start[4:], guess.controls / CONTROL_SCALE))
-    return np.hstack((guess.states, controls))
 
 
 class Ours:
@@ -244,7 +244,7 @@ class Ours:
         self._solver = mpc_module.SOLVERS[name](chosen, n_lanes)
         self.how = self._solver.how
 
-    def solve(self, instance: Instance, guess: Guess) -> tuple[np.ndarray, bool]:
+    def solve(self, instance: Instance, guess: np.ndarray) -> tuple[np.ndarray, bool]:
         solution = self._solver.solve(instance, guess)
         if not solution.solved:
             return np.full(instance.low.shape, np.nan), False
@@ -314,14 +314,14 @@ def compare(horizon: int, n: int) -> pd.DataFrame:
     instances = [copy.deepcopy(desk.write(problem)) for problem in problems]
     judge, rows = Judge(settings, n_lanes), []
     built = methods(settings, n_lanes)
-    warm: dict[str, Guess | None] = dict.fromkeys(built)
+    warm: dict[str, np.ndarray] = {}
     for i, (problem, instance) in enumerate(zip(problems, instances, strict=True)):
-        hold = host._hold(problem)
-        nothing = judge.reward(instance, hold.controls / CONTROL_SCALE)
+        hold = host.hold(problem)
+        nothing = judge.reward(instance, hold / CONTROL_SCALE)
         order = list(built)[i % len(built) :] + list(built)[: i % len(built)]
         for name in order:
             for start in ("cold", "warm"):
-                guess = hold if start == "cold" else (warm[name] or hold)
+                guess = hold if start == "cold" else warm.get(name, hold)
                 took = []
                 for _ in range(REPEATS):
                     begin = time.process_time()
@@ -331,7 +331,7 @@ def compare(horizon: int, n: int) -> pd.DataFrame:
                 ms = float(np.median(took))
                 rows.append((name, start, i, ms, took[0], value, nothing, solved))
             if solved:
-                warm[name] = next_guess(settings, problem, controls * CONTROL_SCALE)
+                warm[name] = shifted(controls * CONTROL_SCALE)
     columns = ["method", "start", "instance", "ms", "first_ms", "reward", "nothing", "solved"]
     table = pd.DataFrame(rows, columns=columns)
     table["best"] = table.groupby("instance")["reward"].transform("max")
@@ -340,15 +340,6 @@ def compare(horizon: int, n: int) -> pd.DataFrame:
         (table["best"] - table["reward"]) > 0.01 * (table["best"] - table["nothing"])
     )
     return table.assign(horizon=horizon)
-
-
-def next_guess(settings: PlannerSettings, problem: Problem, controls: np.ndarray) -> Guess:
-    """Return a plan shifted by one step, its last control held."""
-    bends = problem.road.rows[:-1, -1].tolist()
-    states = [tuple(problem.ego)]
-    for u, bend in zip(controls, bends, strict=True):
-        states.append(dynamics.step(states[-1], u, 0.1, settings.friction, bend))
-    return shifted(Guess(np.array(states), controls), settings.friction, bends[-1])
 
 
 def lanes_of(problem: Problem) -> int:

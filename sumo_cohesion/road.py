@@ -18,8 +18,6 @@ from sumo_cohesion.state import FloatArray, IntArray
 
 SPACING = 1.0
 """Metres between vertices of the reference line."""
-_SAME = 1e-6
-"""Metres per metre of road by which a lane's place may change and count as the same."""
 
 
 class RoadAhead(NamedTuple):
@@ -72,7 +70,8 @@ class Road:
     _near: dict[tuple[int, int], int] = field(init=False, repr=False, compare=False)
     _centre_or_far: FloatArray = field(init=False, repr=False, compare=False)
     _ahead: FloatArray = field(init=False, repr=False, compare=False)
-    _same_until: IntArray = field(init=False, repr=False, compare=False)
+    _same_until: list[int] = field(init=False, repr=False, compare=False)
+    _looked_up: dict[tuple[int, int, int], RoadAhead] = field(init=False, repr=False, compare=False)
     _bends: list[float] = field(init=False, repr=False, compare=False)
     _lane_rows: list[list[float]] = field(init=False, repr=False, compare=False)
     _strips: FloatArray = field(init=False, repr=False, compare=False)
@@ -95,11 +94,13 @@ class Road:
         # Side by side, so that one look finds everything.
         ahead = np.column_stack((forked, width, self.speed_limit, self.curvature))
         object.__setattr__(self, "_ahead", ahead)
-        object.__setattr__(self, "_same_until", _same_until(forked))
         object.__setattr__(self, "_bends", self.curvature.tolist())
         object.__setattr__(self, "_lane_rows", centre.tolist())
         strips = _strips(self.lane_centre, self.lane_width).reshape(-1, 2)
         object.__setattr__(self, "_strips", strips)  # a row per vertex and lane
+        everything = np.column_stack((ahead, strips.reshape(len(ahead), -1)))
+        object.__setattr__(self, "_same_until", _same_until(everything))
+        object.__setattr__(self, "_looked_up", {})
 
     def index(self, s: ArrayLike) -> IntArray:
         """Vertex nearest to each arc length s (m)."""
@@ -159,19 +160,32 @@ class Road:
         """
         last, s0, n_lanes = self.x.size - 1, self.s0, self.lane_centre.shape[1]
         i = [min(max(round((place - s0) / SPACING), 0), last) for place in s]
-        rows = self._ahead.take(i, axis=0)
-        # One look is enough where nothing changes, as is usual.
-        unchanged = i[0] <= i[-1] <= self._same_until[i[0]]
+        until = self._same_until[i[0]]
+        if i[0] <= i[-1] <= until:
+            # One look is enough where nothing changes.
+            off = [abs(centre - d) for centre in self._ahead[i[0], :n_lanes].tolist()]
+            lane = off.index(min(off))
+            known = self._looked_up.get((until, lane, len(i)))
+            if known is None:
+                known = self._look_up(i, [lane] * len(i))
+                self._looked_up[until, lane, len(i)] = known
+            return known
         followed = []
-        for row in rows[: 1 if unchanged else None, :n_lanes].tolist():
+        for row in self._ahead[i, :n_lanes].tolist():
             off = [abs(centre - d) for centre in row]
             lane = off.index(min(off))
             d = row[lane] if isfinite(row[lane]) else d
             followed.append(lane)
-        if unchanged:
-            followed *= len(i)
-        strips = [vertex * n_lanes + lane for vertex, lane in zip(i, followed, strict=True)]
-        return RoadAhead(rows, self._strips.take(strips, axis=0))
+        return self._look_up(i, followed)
+
+    def _look_up(self, i: list[int], lanes: list[int]) -> RoadAhead:
+        """Return the rows of some vertices, and the edges of a lane at each; read-only."""
+        n_lanes = self.lane_centre.shape[1]
+        strips = [vertex * n_lanes + lane for vertex, lane in zip(i, lanes, strict=True)]
+        ahead = RoadAhead(self._ahead.take(i, axis=0), self._strips.take(strips, axis=0))
+        for array in ahead:
+            array.setflags(write=False)
+        return ahead
 
     def project(self, x: float, y: float) -> tuple[float, float, float, float]:
         """Road coordinates of one Cartesian point.
@@ -258,13 +272,11 @@ def _forked(centre: FloatArray, width: FloatArray, n_route_lanes: int) -> FloatA
     return forked
 
 
-def _same_until(centre: FloatArray) -> IntArray:
-    """Return the last vertex up to which the lanes stay where they are, from each vertex: (G,)."""
-    off = np.where(np.isinf(centre), -1e9, centre)
-    # What creeps in bends is far below this, and lanes are metres apart.
-    changes = np.flatnonzero((np.abs(np.diff(off, axis=0)) > _SAME).any(axis=1))
-    ends = np.append(changes, len(centre) - 1)
-    return np.asarray(ends[np.searchsorted(ends, np.arange(len(centre)))])
+def _same_until(rows: FloatArray) -> list[int]:
+    """Return the last row up to which all are the same, for every row."""
+    same = (rows[1:] == rows[:-1]) | (np.isnan(rows[1:]) & np.isnan(rows[:-1]))
+    ends = np.append(np.flatnonzero(~same.all(axis=1)), len(rows) - 1)
+    return list(ends[np.searchsorted(ends, np.arange(len(rows)))].tolist())
 
 
 def _strips(centre: FloatArray, width: FloatArray) -> FloatArray:

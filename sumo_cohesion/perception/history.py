@@ -10,8 +10,10 @@ from __future__ import annotations
 from array import array
 from bisect import bisect_left, bisect_right
 from collections import deque
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterable
+from itertools import compress
 from math import atan2
+from operator import not_
 
 from sumo_cohesion.perception.habit import Features, Habit
 from sumo_cohesion.state import Observation
@@ -20,8 +22,6 @@ State = tuple[float, float, float, float]
 """s, d (m), heading (rad, of the displacement), speed (m/s), in the road frame."""
 Describe = Callable[[State, State, float, float], Features]
 """Features of a transition: (before, after, seconds between, road curvature)."""
-
-_NONE = range(0)
 
 
 class Track:
@@ -99,18 +99,6 @@ class Track:
         if self.steps and self.steps[-1] == self.step:
             return self.features[-1]
         return None
-
-    def passed(self, s: float, reach: float) -> range:
-        """Which transitions have their middle within ``reach`` (m) of s; cars do not reverse."""
-        middle_s = self.middle_s
-        if not middle_s or middle_s[-1] < s - reach or middle_s[0] > s + reach:
-            return _NONE  # most cars, most of the time
-        first = bisect_left(middle_s, s - reach)
-        return range(first, bisect_right(middle_s, s + reach, first))
-
-    def passed_by(self, s: float) -> bool:
-        """Tell whether the car was seen on both sides of s, driving forwards."""
-        return bool(self.middle_s) and self.middle_s[0] <= s < self.middle_s[-1]
 
     def across(self, s: float) -> float | None:
         """Where across the road (d, m) the car was when it passed s; None if that is unknown."""
@@ -199,34 +187,25 @@ class History:
 
     def push(self, observation: Observation) -> None:
         """Remember one observation, of those to follow; call it once per step."""
-        self._now += 1
+        self._now = now = self._now + 1
         self._forget()
         self.ego_path.add(observation.ego.s, observation.ego.d)
-        rows: Sequence[State] = observation.states.tolist()
-        in_sight = []
-        for name, state, curvature, voter in zip(
-            observation.ids,
-            rows,
-            observation.curvature.tolist(),
-            observation.voter,
-            strict=True,
-        ):
-            if not voter:
-                self._tracks.pop(name, None)  # it may have been one
-                continue
-            track = self._tracks.get(name)
+        voter, tracks = observation.voter, self._tracks
+        rows: Iterable[State] = observation.states.tolist()
+        names, curvatures = observation.ids, observation.curvature.tolist()
+        if not all(voter):
+            for name in compress(names, map(not_, voter)):
+                tracks.pop(name, None)  # it may have been one
+            names, rows = tuple(compress(names, voter)), compress(rows, voter)
+            curvatures = compress(curvatures, voter)
+        least_move, interval, describe = 0.1 * self._step_length, self._interval, self._describe
+        self._in_sight = in_sight = []
+        for name, state, curvature in zip(names, rows, curvatures, strict=True):
+            track = tracks.get(name)
             if track is None:
-                track = self._tracks[name] = Track(self._lag, self._habit())
+                track = tracks[name] = Track(self._lag, self._habit())
             in_sight.append(track)
-            track.see(
-                self._now,
-                state,
-                curvature,
-                0.1 * self._step_length,
-                self._interval,
-                self._describe,
-            )
-        self._in_sight = in_sight
+            track.see(now, state, curvature, least_move, interval, describe)
 
     def _forget(self) -> None:
         before = self._now - self._memory
@@ -239,6 +218,23 @@ class History:
         """Tracks of the voters in the latest observation."""
         return self._in_sight
 
-    def all(self) -> Collection[Track]:
-        """Tracks of all remembered voters, in sight or not."""
-        return self._tracks.values()
+    def near(self, s: float, reach: float) -> list[tuple[Track, range]]:
+        """Tracks, in sight or not, with transitions whose middle is within ``reach`` (m) of s.
+
+        And which of their transitions: cars do not reverse.
+        """
+        low, high, found = s - reach, s + reach, []
+        for track in self._tracks.values():
+            middle_s = track.middle_s
+            if middle_s and middle_s[-1] >= low and middle_s[0] <= high:
+                first = bisect_left(middle_s, low)
+                found.append((track, range(first, bisect_right(middle_s, high, first))))
+        return found
+
+    def passed(self, s: float) -> list[Track]:
+        """Tracks, in sight or not, of cars that were seen on both sides of s."""
+        return [
+            track
+            for track in self._tracks.values()
+            if (middle_s := track.middle_s) and middle_s[0] <= s < middle_s[-1]
+        ]

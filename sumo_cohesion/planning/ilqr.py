@@ -22,7 +22,7 @@ import casadi as ca
 import numpy as np
 
 from sumo_cohesion.planning.compiled import BoundCall, compiled
-from sumo_cohesion.planning.problem import Guess, Instance, Solution
+from sumo_cohesion.planning.problem import Instance, Solution
 from sumo_cohesion.planning.settings import PlannerSettings
 from sumo_cohesion.planning.stage import (
     CONTROL_SCALE,
@@ -34,6 +34,7 @@ from sumo_cohesion.planning.stage import (
     limited_stage,
     make_stage,
 )
+from sumo_cohesion.state import FloatArray
 
 TOLERANCE = 1e-7
 """Relative decrease of the cost at which an iteration is the last one."""
@@ -92,8 +93,8 @@ class Ilqr:
             [self._x_new, self._u_new, self._cost, self._terms],
         )
 
-    def solve(self, instance: Instance, guess: Guess) -> Solution:
-        """Solve from a guess of the controls; the guess of the states is not needed."""
+    def solve(self, instance: Instance, guess: FloatArray) -> Solution:
+        """Solve from guessed controls, (T, 2)."""
         start = time.perf_counter()
         self._load(instance, guess)
         cost = self._roll_out(0.0)
@@ -133,10 +134,10 @@ class Ilqr:
             "too many iterations", self._settings.max_iterations, start, solved=False
         )
 
-    def _load(self, instance: Instance, guess: Guess) -> None:
+    def _load(self, instance: Instance, guess: FloatArray) -> None:
         self._p[:], self._x[0] = instance.stages, instance.start
         self._low[:], self._high[:], self._most[:] = instance.low, instance.high, instance.change
-        np.divide(guess.controls, CONTROL_SCALE, out=self._u)  # limited as it is rolled out
+        np.divide(guess, CONTROL_SCALE, out=self._u)  # limited as it is rolled out
         self._step[:], self._gain[:] = 0.0, 0.0
 
     def _search(self, cost: float, promised: float) -> float | None:

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from sumo_cohesion.planning.compiled import BoundCall, compiled
-from sumo_cohesion.planning.problem import Guess, Instance, Solution
+from sumo_cohesion.planning.problem import Instance, Solution
 from sumo_cohesion.planning.settings import PlannerSettings
 from sumo_cohesion.planning.stage import (
     CONTROL_SCALE,
@@ -60,15 +60,15 @@ class Lbfgs:
         outputs = [self._cost, self._gradient, self._states, self._driven, self._terms]
         self._run = BoundCall(function, [self._start, self._u, self._p], outputs)
 
-    def solve(self, instance: Instance, guess: Guess) -> Solution:
-        """Solve from a guess of the controls; the guess of the states is not needed."""
+    def solve(self, instance: Instance, guess: FloatArray) -> Solution:
+        """Solve from guessed controls, (T, 2)."""
         start = time.perf_counter()
         self._p[:], self._start[:] = instance.stages, instance.start
         low, high = instance.low.copy(), instance.high.copy()
         last, most = instance.start[4:], instance.change[0]
         low[0] = np.minimum(np.maximum(low[0], last - most), high[0])
         high[0] = np.maximum(np.minimum(high[0], last + most), low[0])
-        first = np.clip(guess.controls / CONTROL_SCALE, low, high)
+        first = np.clip(guess / CONTROL_SCALE, low, high)
         result = minimize(
             self._cost_and_gradient,
             first.ravel(),

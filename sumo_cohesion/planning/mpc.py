@@ -12,15 +12,13 @@ from typing import Protocol
 
 import numpy as np
 
-from sumo_cohesion.planning import dynamics
-from sumo_cohesion.planning.dynamics import DT
 from sumo_cohesion.planning.ilqr import Ilqr
 from sumo_cohesion.planning.instance import shared_desk
 from sumo_cohesion.planning.lbfgs import Lbfgs
 from sumo_cohesion.planning.nlp import InteriorPoint
-from sumo_cohesion.planning.problem import Guess, Instance, Problem, Solution
+from sumo_cohesion.planning.problem import Instance, Problem, Solution
 from sumo_cohesion.planning.settings import PlannerSettings
-from sumo_cohesion.state import RESCUED
+from sumo_cohesion.state import RESCUED, FloatArray
 
 
 class Solver(Protocol):
@@ -29,8 +27,8 @@ class Solver(Protocol):
     name: str
     how: str
 
-    def solve(self, instance: Instance, guess: Guess) -> Solution:
-        """Solve one instance; a failure is a solution that is not ``solved``."""
+    def solve(self, instance: Instance, guess: FloatArray) -> Solution:
+        """Solve one instance from guessed controls, (T, 2); a failure is not ``solved``."""
 
 
 SOLVERS: dict[str, Callable[[PlannerSettings, int], Solver]] = {
@@ -61,8 +59,9 @@ class Mpc:
         self.n_lanes = n_lanes
         self.solver = shared_solver(settings.solver, settings, n_lanes)
         self._desk = shared_desk(settings, n_lanes)
-        self._warm: Guess | None = None
-        self._rest: Guess | None = None
+        self._last: Solution | None = None
+        self._warm = False
+        self._age = 0
 
     @property
     def how(self) -> str:
@@ -70,44 +69,39 @@ class Mpc:
         return f"{self.solver.name}, {self.solver.how}"
 
     @property
-    def rest(self) -> Guess | None:
+    def rest(self) -> Solution | None:
         """What is left of the last solution after a failure, while that is more than half of it."""
-        return self._rest
+        last, age = self._last, self._age
+        if last is None or 2 * (self.settings.horizon - age) <= self.settings.horizon:
+            return None
+        return replace(last, states=last.states[age:], controls=last.controls[age:])
 
     def drop_rest(self) -> None:
         """Forget what is left of the last solution: the ego has not driven along it."""
-        self._rest = None
+        self._age = self.settings.horizon
 
     def reset(self) -> None:
         """Forget the last solution."""
-        self._warm = self._rest = None
+        self._last, self._warm = None, False
 
     def solve(self, problem: Problem) -> Solution:
         """Solve one instance; never raises for a solver's failure, see ``solved``."""
-        self._keep_rest()
+        self._age += 1
         instance = self._desk.write(problem)
         if instance is None:
             # Some solvers never return from a problem that is not a number.
             return _failed("input is not finite")
-        guess = self._warm or self._hold(problem)
+        last = self._last if self._warm else None
+        guess = self.hold(problem) if last is None else shifted(last.controls)
         solution = self._attempt(self.solver, instance, guess)
         if not solution.solved:
-            solution = self._rescued(instance, self._hold(problem), solution)
+            solution = self._rescued(instance, self.hold(problem), solution)
         if solution.solved:
-            self._rest = Guess(solution.states, solution.controls)
-            last_bend = float(problem.road.rows[-2, -1])
-            self._warm = shifted(self._rest, self.settings.friction, last_bend)
-        else:
-            self._warm = None
+            self._last, self._age = solution, 0
+        self._warm = solution.solved
         return solution
 
-    def _keep_rest(self) -> None:
-        """Drop from the last solution the step that has been driven since."""
-        rest = self._rest
-        enough = rest is not None and 2 * (len(rest.controls) - 1) > self.settings.horizon
-        self._rest = Guess(rest.states[1:], rest.controls[1:]) if rest and enough else None
-
-    def _attempt(self, solver: Solver, instance: Instance, guess: Guess) -> Solution:
+    def _attempt(self, solver: Solver, instance: Instance, guess: FloatArray) -> Solution:
         """Let a solver try; whatever goes wrong in it is a solution that is not ``solved``."""
         try:
             solution = solver.solve(instance, guess)
@@ -119,7 +113,7 @@ class Mpc:
             return _failed(f"{solver.name} returned garbage", solution)
         return solution
 
-    def _rescued(self, instance: Instance, guess: Guess, failed: Solution) -> Solution:
+    def _rescued(self, instance: Instance, guess: FloatArray, failed: Solution) -> Solution:
         """Try IPOPT, slower and sturdier."""
         ipopt = shared_solver("ipopt", self.settings, self.n_lanes)
         second = self._attempt(ipopt, instance, guess)
@@ -130,26 +124,17 @@ class Mpc:
             wall_time=failed.wall_time + second.wall_time,
         )
 
-    def _hold(self, problem: Problem) -> Guess:
-        """Guess that keeps speed and heading along the road."""
-        state: tuple[float, ...] = problem.ego
-        states, controls = [state], []
-        for curvature in problem.road.rows[:-1, -1].tolist():
-            control = (curvature, self.settings.friction * state[3])
-            state = dynamics.step(state, control, DT, self.settings.friction, curvature)
-            states.append(state)
-            controls.append(control)
-        return Guess(np.array(states), np.array(controls))
+    def hold(self, problem: Problem) -> FloatArray:
+        """Return controls that keep speed and heading along the road, (T, 2)."""
+        controls = np.empty((self.settings.horizon, 2))
+        controls[:, 0] = problem.road.rows[:-1, -1]
+        controls[:, 1] = self.settings.friction * problem.ego.speed
+        return controls
 
 
-def shifted(plan: Guess, friction: float, road_curvature: float) -> Guess:
-    """Shift a plan by one step in time: the last control is held, in a bend (1/m)."""
-    states, controls = np.empty_like(plan.states), np.empty_like(plan.controls)
-    states[:-1], controls[:-1] = plan.states[1:], plan.controls[1:]
-    final, held = plan.states[-1].tolist(), plan.controls[-1].tolist()
-    states[-1] = dynamics.step(final, held, DT, friction, road_curvature)
-    controls[-1] = held
-    return Guess(states, controls)
+def shifted(controls: FloatArray) -> FloatArray:
+    """Shift controls, (T, 2), by one step in time; the last is held."""
+    return np.concatenate((controls[1:], controls[-1:]))
 
 
 def _failed(status: str, what: Solution | None = None) -> Solution:

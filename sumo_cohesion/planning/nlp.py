@@ -12,11 +12,14 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from sumo_cohesion.planning.problem import Guess, Instance, Solution
+from sumo_cohesion.planning import dynamics
+from sumo_cohesion.planning.dynamics import DT
+from sumo_cohesion.planning.problem import Instance, Solution
 from sumo_cohesion.planning.settings import PlannerSettings
 from sumo_cohesion.planning.stage import (
     CONTROL_SCALE,
     N_STATES,
+    SCALES,
     TERMS,
     StageParameters,
     make_stage,
@@ -34,6 +37,7 @@ class InteriorPoint:
         self.name = name
         self._settings = settings
         layout = StageParameters(settings, n_lanes)
+        self._bends = layout.columns("road_curvature")
         horizon = settings.horizon
         stage = make_stage(settings, layout)
         terms = stage.landed(ca.vertcat(*[stage.terms[term] for term in TERMS]))
@@ -75,8 +79,8 @@ class InteriorPoint:
             }
         return common | {"ipopt.print_level": 0, "ipopt.sb": "yes", "ipopt.max_iter": iterations}
 
-    def solve(self, instance: Instance, guess: Guess) -> Solution:
-        """Solve from a guess; never raises for the solver's failure, see ``solved``."""
+    def solve(self, instance: Instance, guess: FloatArray) -> Solution:
+        """Solve from guessed controls, (T, 2); never raises for the solver's failure."""
         start = time.perf_counter()
         parameters = np.concatenate(
             (instance.start, instance.stages.ravel(), instance.change.ravel())
@@ -114,12 +118,21 @@ class InteriorPoint:
         rows = np.hstack((np.tile(free, (horizon, 1)), instance.high))
         return lower, np.concatenate((rows.ravel(), free))
 
-    def _pack(self, instance: Instance, guess: Guess) -> FloatArray:
-        controls = guess.controls / CONTROL_SCALE
-        states = np.hstack((guess.states, np.vstack((instance.start[4:], controls))))
-        return np.concatenate((np.hstack((states[:-1], controls)).ravel(), states[-1]))
+    def _pack(self, instance: Instance, guess: FloatArray) -> FloatArray:
+        states = roll_out(instance, guess, self._bends, self._settings.friction)
+        rows = np.hstack((states[:-1], guess / CONTROL_SCALE))
+        return np.concatenate((rows.ravel(), states[-1]))
 
     def _unpack(self, z: FloatArray) -> tuple[FloatArray, FloatArray]:
         rows = z[:-N_STATES].reshape(self._settings.horizon, N_STATES + 2)
         states = np.vstack((rows[:, :N_STATES], z[-N_STATES:]))
         return states[:, :4], rows[:, N_STATES:] * CONTROL_SCALE
+
+
+def roll_out(instance: Instance, controls: FloatArray, bends: slice, friction: float) -> FloatArray:
+    """Whole states, (T + 1, 6), that controls, (T, 2), lead to; ``bends`` as in the stages."""
+    state, rows = instance.start[:4].tolist(), [instance.start]
+    for control, bend in zip(controls.tolist(), instance.stages[:, bends].ravel(), strict=True):
+        state = dynamics.step(state, control, DT, friction, float(bend))
+        rows.append(np.array((*state, control[0] / SCALES[0], control[1] / SCALES[1])))
+    return np.array(rows)

@@ -212,10 +212,11 @@ class CohesivePlanner:
 
 def nearest_cars(observation: Observation, n: int) -> FloatArray:
     """Return the up to n cars nearest to the ego, nearest first: rows as in Problem.cars."""
-    offset = observation.states[:, :2] - observation.ego[:2]
-    nearest = (offset * offset).sum(axis=1).argsort(kind="stable")[:n]
+    ego, states = observation.ego, observation.states
+    distance = (states[:, 0] - ego.s) ** 2 + (states[:, 1] - ego.d) ** 2
+    nearest = distance.argsort(kind="stable")[:n]
     cars = np.empty((len(nearest), 7))
-    cars[:, :4] = observation.states.take(nearest, axis=0)
+    cars[:, :4] = states.take(nearest, axis=0)
     cars[:, 4:6] = observation.sizes.take(nearest, axis=0)
     cars[:, 6] = observation.curvature.take(nearest)
     return cars

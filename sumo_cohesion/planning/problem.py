@@ -63,14 +63,6 @@ class Instance:
 
 
 @dataclass(frozen=True)
-class Guess:
-    """Where a solver starts: states (T + 1, 4), controls (T, 2)."""
-
-    states: FloatArray
-    controls: FloatArray
-
-
-@dataclass(frozen=True)
 class Solution:
     """What the solver gave: states (T + 1, 4), controls (T, 2), and how it went.
 

@@ -88,6 +88,12 @@ class StageParameters:
         }
         self.size = sum(self.sizes.values())
 
+    def columns(self, name: str) -> slice:
+        """Where a part lies."""
+        before = list(self.sizes)[: list(self.sizes).index(name)]
+        start = sum(self.sizes[other] for other in before)
+        return slice(start, start + self.sizes[name])
+
     def symbols(self) -> dict[str, Any]:
         """Return one symbol per part."""
         return {name: ca.SX.sym(name, size) for name, size in self.sizes.items()}

@@ -36,18 +36,21 @@ def group_votes(ego: RoadState, history: History, road: Road, settings: Cohesion
     - road: cars that are near the ego on the road now.
     """
     votes: Votes = {group: [] for group in GROUPS}
-    for track in history.all():
+    for track, passed in history.near(ego.s, settings.position_length):
         oncoming = abs(track.state[2]) > pi / 2  # nobody to follow
-        if not oncoming and (vote := _vote_at_place(track, ego, settings)):
+        if not oncoming and (vote := _vote_at_place(track, passed, ego.d, settings)):
             votes["position"].append(vote)
     own_lane = road.lane_of(ego.s, ego.d)
+    farthest = max(settings.road_reach, settings.lane_ahead, settings.lane_behind)
     for track in history.in_sight():
-        newest = track.newest()
         s, d, heading, _ = track.state
-        if newest is None or abs(heading) > pi / 2:
+        ahead = s - ego.s
+        if abs(ahead) > farthest or abs(heading) > pi / 2:
+            continue
+        newest = track.newest()
+        if newest is None:
             continue
         vote = Vote(newest, track.habits[-1])
-        ahead = s - ego.s
         if abs(ahead) <= settings.road_reach:
             votes["road"].append(vote)
         within = -settings.lane_behind <= ahead <= settings.lane_ahead
@@ -56,10 +59,11 @@ def group_votes(ego: RoadState, history: History, road: Road, settings: Cohesion
     return votes
 
 
-def _vote_at_place(track: Track, ego: RoadState, settings: CohesionSettings) -> Vote | None:
-    """Mean features of one car's transitions around the ego's place; None if it kept aside."""
-    passed = track.passed(ego.s, settings.position_length)
-    across, d, width = track.middle_d, ego.d, settings.position_width
+def _vote_at_place(
+    track: Track, passed: range, d: float, settings: CohesionSettings
+) -> Vote | None:
+    """Mean features of those transitions that are near d (m), too; None if none is."""
+    across, width = track.middle_d, settings.position_width
     here = [i for i in passed if abs(across[i] - d) <= width]
     if not here:
         return None

@@ -91,9 +91,7 @@ def _companions(
     """
     path = history.ego_path
     companions = []
-    for track in history.all():
-        if not track.passed_by(ego.s):
-            continue
+    for track in history.passed(ego.s):
         s = max(ego.s - settings.place_look_back, path.first, track.middle_s[0])
         d = track.across(s)
         if d is not None and abs(d - path.at(s)) <= settings.position_width:

@@ -10,8 +10,8 @@ import pytest
 
 from sumo_cohesion import Rollout, run
 from sumo_cohesion.planning import mpc
-from sumo_cohesion.planning.problem import Guess, Instance, Solution
-from sumo_cohesion.state import RESCUED
+from sumo_cohesion.planning.problem import Instance, Solution
+from sumo_cohesion.state import RESCUED, FloatArray
 from sumo_cohesion.traffic.simulator import Simulator
 
 KINDS = ("raises", "times out", "not a number", "infinite", "out of bounds", "noise")
@@ -26,15 +26,15 @@ class OftenFaulty:
     def __init__(self, solver: mpc.Solver, rng: Random, count: list[str]) -> None:
         self.name, self._solver, self._rng, self._count = solver.name, solver, rng, count
 
-    def solve(self, instance: Instance, guess: Guess) -> Solution:
+    def solve(self, instance: Instance, guess: FloatArray) -> Solution:
         if self._rng.random() >= 0.1:
             return self._solver.solve(instance, guess)
         kind = self._rng.choice(KINDS)
         self._count.append(kind)
         if kind == "raises":
             raise ValueError("matrix is singular")
-        states, controls = guess.states.copy(), guess.controls.copy()
-        states[0] = instance.start[:4]
+        # Nothing that its controls lead to: the first state again and again.
+        states, controls = np.tile(instance.start[:4], (len(guess) + 1, 1)), guess.copy()
         if kind == "not a number":
             controls[:] = np.nan
         elif kind == "infinite":
@@ -91,7 +91,7 @@ class Broken:
 
     name, how = "ipopt", "broken"
 
-    def solve(self, instance: Instance, guess: Guess) -> Solution:
+    def solve(self, instance: Instance, guess: FloatArray) -> Solution:
         raise RuntimeError("nothing works")
 
 

@@ -13,12 +13,20 @@ from sumo_cohesion.experiments.drive import ask, drive
 from sumo_cohesion.perception.history import History
 from sumo_cohesion.planning import mpc
 from sumo_cohesion.planning.planners import CohesivePlanner
-from sumo_cohesion.planning.problem import Guess, Instance, Solution
+from sumo_cohesion.planning.problem import Instance, Solution
 from sumo_cohesion.planning.settings import PlannerSettings
 from sumo_cohesion.road import Road
 from sumo_cohesion.social.memory import new_history
 from sumo_cohesion.social.settings import CohesionSettings
-from sumo_cohesion.state import RESCUED, CartesianState, Control, Observation, Plan, RoadState
+from sumo_cohesion.state import (
+    RESCUED,
+    CartesianState,
+    Control,
+    FloatArray,
+    Observation,
+    Plan,
+    RoadState,
+)
 
 SETTINGS = PlannerSettings()
 COHESION = CohesionSettings()
@@ -122,7 +130,7 @@ class Faulty:
     def __init__(self, solver: mpc.Solver, fault: str) -> None:
         self.name, self._solver, self._fault = solver.name, solver, fault
 
-    def solve(self, instance: Instance, guess: Guess) -> Solution:
+    def solve(self, instance: Instance, guess: FloatArray) -> Solution:
         if self._fault == "raises":
             raise RuntimeError("out of luck")
         good = self._solver.solve(instance, guess)

@@ -132,8 +132,8 @@ def test_history_memory_is_bounded() -> None:
             f"car_{c}": (5.0 * (k - 10 * c), 0.0, 50.0) for c in range(k // 10 - 4, k // 10 + 1)
         }
         h.push(observe(0.1 * k, {n: v for n, v in names.items() if v[0] >= 0}))
-        assert sum(len(t.steps) for t in h.all()) <= 5 * 50
-        assert len(h.all()) <= 5 + 4
+        assert sum(len(t.steps) for t in h._tracks.values()) <= 5 * 50
+        assert len(h._tracks.values()) <= 5 + 4
 
 
 def test_groups_who_votes_where(highway: Road) -> None:

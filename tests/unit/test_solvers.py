@@ -115,9 +115,7 @@ def test_squares_have_the_gradient_of_the_cost_and_are_never_negative() -> None:
 
 def part(rows: np.ndarray, name: str) -> np.ndarray:
     """Columns of a stage's parameters, (T, size)."""
-    sizes = StageParameters(SETTINGS, 3).sizes
-    ends = dict(zip(sizes, np.cumsum(list(sizes.values())).tolist(), strict=True))
-    return rows[:, ends[name] - sizes[name] : ends[name]]
+    return rows[:, StageParameters(SETTINGS, 3).columns(name)]
 
 
 def test_what_solvers_read_is_what_is_known() -> None:
