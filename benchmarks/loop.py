@@ -31,7 +31,7 @@ def write_platoon(folder: Path, seconds: float) -> Path:
     last = write_highway(folder, seconds)
     cars = "".join(
         f'<vehicle id="h{i}" type="human" route="all" depart="0" departLane="{i % 3}" '
-        f'departPos="{20 + 30 * (i // 3) + 10 * (i % 3)}" departSpeed="desired"/>'
+        f'departPos="{_place(i)}" departSpeed="25"/>'
         for i in range(HUMANS + 1)
         if i != EGO_PLACE
     )
@@ -42,8 +42,13 @@ def write_platoon(folder: Path, seconds: float) -> Path:
     )
     path = folder / "platoon.toml"
     text = SCENARIO.format(duration=seconds, last=last).replace("depart = 30.0", "depart = 0.0")
-    path.write_text(text.replace("position = 100.0", f"position = {30 + 10 * EGO_PLACE}"))
+    path.write_text(text.replace("position = 100.0", f"position = {_place(EGO_PLACE)}"))
     return path
+
+
+def _place(i: int) -> int:
+    """Metres: far enough apart that all are put on the road at once."""
+    return 20 + 45 * (i // 3) + 15 * (i % 3)
 
 
 def bare(path: Path, seed: int, steps: int) -> float:
@@ -93,7 +98,8 @@ def main() -> None:
         path = write_platoon(Path(folder), given.seconds)
         for seed in range(-1, given.seeds):
             spent = {}
-            for planner in ("sumo", "cohesive"):
+            # In turns: whoever comes second finds warmer caches, and a machine of another speed.
+            for planner in ("sumo", "cohesive")[:: 1 if seed % 2 else -1]:
                 spent[planner], rollout = looped(path, planner, max(seed, 0))
                 if seed >= 0:
                     shares[planner].append(rooms(rollout))

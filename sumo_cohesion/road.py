@@ -5,8 +5,9 @@ Pure geometry: it knows neither SUMO nor files. ``traffic.network`` builds it fr
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from bisect import bisect_left
 from dataclasses import dataclass, field
+from itertools import pairwise
 from math import floor, isfinite, pi
 from typing import NamedTuple
 
@@ -74,6 +75,7 @@ class Road:
     _looked_up: dict[tuple[int, int, int], RoadAhead] = field(init=False, repr=False, compare=False)
     _bends: list[float] = field(init=False, repr=False, compare=False)
     _lane_rows: list[list[float]] = field(init=False, repr=False, compare=False)
+    _borders: list[tuple[list[float], list[int]]] = field(init=False, repr=False, compare=False)
     _strips: FloatArray = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -96,6 +98,7 @@ class Road:
         object.__setattr__(self, "_ahead", ahead)
         object.__setattr__(self, "_bends", self.curvature.tolist())
         object.__setattr__(self, "_lane_rows", centre.tolist())
+        object.__setattr__(self, "_borders", _borders(centre.tolist()))
         strips = _strips(self.lane_centre, self.lane_width).reshape(-1, 2)
         object.__setattr__(self, "_strips", strips)  # a row per vertex and lane
         everything = np.column_stack((ahead, strips.reshape(len(ahead), -1)))
@@ -130,12 +133,9 @@ class Road:
 
     def lane_of(self, s: float, d: float) -> int:
         """Return lane_index of one point: scalar arithmetic, faster than arrays."""
-        lanes = self._lane_rows[min(max(round((s - self.s0) / SPACING), 0), self.x.size - 1)]
-        nearest, best = 0, float("inf")
-        for lane, centre in enumerate(lanes):
-            if abs(centre - d) < best:
-                nearest, best = lane, abs(centre - d)
-        return nearest
+        vertex = min(max(round((s - self.s0) / SPACING), 0), self.x.size - 1)
+        borders, lanes = self._borders[vertex]
+        return lanes[bisect_left(borders, d)]
 
     def nearest_lane(self, s: float, d: float) -> float:
         """Lateral position (m) of the lane centre nearest to one point."""
@@ -152,24 +152,27 @@ class Road:
         right, left = self._strips[self.index(s) * self.lane_centre.shape[1] + lane].T
         return right, left
 
-    def ahead(self, s: Sequence[float], d: float) -> RoadAhead:
-        """Look the road up at n places s (m), one after the other.
+    def ahead(self, s: float, d: float, pace: float, n: int) -> RoadAhead:
+        """Look the road up at n places, from s (m) on, ``pace`` (m) apart.
 
         The strip is that of the lane that holds d (m) at the first place and goes on from there:
         where an exit parts from the route, each has its own.
         """
         last, s0, n_lanes = self.x.size - 1, self.s0, self.lane_centre.shape[1]
-        i = [min(max(round((place - s0) / SPACING), 0), last) for place in s]
-        until = self._same_until[i[0]]
-        if i[0] <= i[-1] <= until:
+        first, end = (
+            min(max(round((place - s0) / SPACING), 0), last) for place in (s, s + pace * (n - 1))
+        )
+        until = self._same_until[first]
+        if first <= end <= until:
             # One look is enough where nothing changes.
-            off = [abs(centre - d) for centre in self._ahead[i[0], :n_lanes].tolist()]
+            off = [abs(centre - d) for centre in self._ahead[first, :n_lanes].tolist()]
             lane = off.index(min(off))
-            known = self._looked_up.get((until, lane, len(i)))
+            known = self._looked_up.get((until, lane, n))
             if known is None:
-                known = self._look_up(i, [lane] * len(i))
-                self._looked_up[until, lane, len(i)] = known
+                known = self._look_up([first] * n, [lane] * n)
+                self._looked_up[until, lane, n] = known
             return known
+        i = [min(max(round((s + pace * t - s0) / SPACING), 0), last) for t in range(n)]
         followed = []
         for row in self._ahead[i, :n_lanes].tolist():
             off = [abs(centre - d) for centre in row]
@@ -270,6 +273,21 @@ def _forked(centre: FloatArray, width: FloatArray, n_route_lanes: int) -> FloatA
         nearest = np.abs(route - centre[:, lane : lane + 1]).min(axis=1)
         forked[nearest < width[:, lane] / 2, lane] = np.inf
     return forked
+
+
+def _borders(rows: list[list[float]]) -> list[tuple[list[float], list[int]]]:
+    """Per row of lane centres: the places half-way between two, and the lanes beside them.
+
+    From right to left. Of lanes in the same place the first counts; without any lane it is lane 0.
+    """
+    known: dict[tuple[float, ...], tuple[list[float], list[int]]] = {}
+    for row in rows:
+        if tuple(row) in known:
+            continue
+        centres = sorted({c for c in row if isfinite(c)})
+        middle = [0.5 * (a + b) for a, b in pairwise(centres)]
+        known[tuple(row)] = middle, [row.index(c) for c in centres] or [0]
+    return [known[tuple(row)] for row in rows]
 
 
 def _same_until(rows: FloatArray) -> list[int]:

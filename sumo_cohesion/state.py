@@ -8,6 +8,7 @@ centre in both.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from math import isfinite
 from typing import NamedTuple
@@ -167,4 +168,4 @@ class Plan:
     wall_time: float = 0.0
     social_time: float = 0.0
     reward: dict[str, float] = field(default_factory=dict)
-    agreement: tuple[AgreementRow, ...] = ()
+    agreement: Sequence[AgreementRow] = ()

@@ -21,7 +21,17 @@ from sumo_cohesion.experiments.metrics import run_metrics
 from sumo_cohesion.experiments.reference import Reference
 from sumo_cohesion.perception.history import History
 from sumo_cohesion.perception.observation import Sensor
-from sumo_cohesion.state import BoolArray, Control, FloatArray, Observation, Plan, RoadState, Scene
+from sumo_cohesion.planning.explanation import Explanation
+from sumo_cohesion.state import (
+    AgreementRow,
+    BoolArray,
+    Control,
+    FloatArray,
+    Observation,
+    Plan,
+    RoadState,
+    Scene,
+)
 from sumo_cohesion.traffic.demand import EGO
 
 if TYPE_CHECKING:
@@ -295,23 +305,17 @@ class Recorder:
     def _agreement_table(self) -> pd.DataFrame:
         cohesion = self._setup.cohesion
         floor, least = cohesion.variance_floor, cohesion.min_cars
-        rows: list[dict[str, object]] = [
-            {
-                "time": time,
-                "group": row.group,
-                "feature": row.feature,
-                "n": row.n,
-                "mean": row.mean,
-                "variance": row.variance,
-                "precision": 1.0 / (row.variance + floor) if row.n >= least else float("nan"),
-                "weight": row.weight,
-                "own": row.own,
-                "pull": row.pull,
-            }
-            for time, _, plan in self._plans
-            for row in plan.agreement
-        ]
-        return as_table("agreement", rows)
+        columns: dict[str, list[Any]] = {name: [] for name in ("time", *AgreementRow._fields)}
+        for time, _, plan in self._plans:
+            rows = plan.agreement
+            if not rows:
+                continue
+            found = rows.columns() if isinstance(rows, Explanation) else zip(*rows, strict=True)
+            for column, values in zip(columns.values(), ([time] * len(rows), *found), strict=True):
+                column.extend(values)
+        table = as_table("agreement", dict(columns))
+        precision = 1.0 / (table["variance"] + floor)
+        return table.assign(precision=precision.where(table["n"] >= least))
 
     def _timing_table(self) -> pd.DataFrame:
         milliseconds = 1e3 * np.array(self._seconds).reshape(-1, len(Seconds._fields))

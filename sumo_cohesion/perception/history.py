@@ -10,7 +10,7 @@ from __future__ import annotations
 from array import array
 from bisect import bisect_left, bisect_right
 from collections import deque
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Sequence
 from itertools import compress
 from math import atan2
 from operator import not_
@@ -102,12 +102,27 @@ class Track:
 
     def across(self, s: float) -> float | None:
         """Where across the road (d, m) the car was when it passed s; None if that is unknown."""
-        after = bisect_right(self.middle_s, s)
-        if after == 0 or after == len(self.middle_s):
+        middle_s, middle_d = self.middle_s, self.middle_d
+        after = bisect_right(middle_s, s)
+        if after == 0 or after == len(middle_s):
             return None
-        s0, s1 = self.middle_s[after - 1], self.middle_s[after]
-        d0, d1 = self.middle_d[after - 1], self.middle_d[after]
-        return d0 + (d1 - d0) * (s - s0) / (s1 - s0)
+        s0, d0 = middle_s[after - 1], middle_d[after - 1]
+        return d0 + (middle_d[after] - d0) * (s - s0) / (middle_s[after] - s0)
+
+    def across_all(self, places: Sequence[float]) -> list[float]:
+        """Where across the road (m) the car was at places ahead of one it has passed.
+
+        ``places`` (m) ascend; as many are answered as the car has passed.
+        """
+        middle_s, middle_d = self.middle_s, self.middle_d
+        after, n, found = 0, len(middle_s), []
+        for s in places:
+            after = bisect_right(middle_s, s, after)
+            if after == n:
+                break
+            s0, d0 = middle_s[after - 1], middle_d[after - 1]
+            found.append(d0 + (middle_d[after] - d0) * (s - s0) / (middle_s[after] - s0))
+        return found
 
     def habit_at(self, s: float) -> Features:
         """Variance of the car's features in its own past when it passed s."""

@@ -9,7 +9,6 @@ from __future__ import annotations
 import importlib
 import sys
 from functools import lru_cache
-from math import cos, sin
 from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Protocol, runtime_checkable
@@ -19,6 +18,7 @@ import numpy as np
 from sumo_cohesion.errors import UserError
 from sumo_cohesion.perception.history import History
 from sumo_cohesion.planning.dynamics import DT
+from sumo_cohesion.planning.explanation import Explanation
 from sumo_cohesion.planning.fallback import fallback
 from sumo_cohesion.planning.problem import Problem, Solution
 from sumo_cohesion.planning.safety import checked
@@ -26,12 +26,12 @@ from sumo_cohesion.planning.settings import PlannerSettings
 from sumo_cohesion.road import Road
 from sumo_cohesion.social.agreement import Agreement, agree, combine
 from sumo_cohesion.social.election import Election
-from sumo_cohesion.social.features import FEATURES, social_features
+from sumo_cohesion.social.features import FEATURES
 from sumo_cohesion.social.groups import group_votes
 from sumo_cohesion.social.place import NOWHERE, Place, agree_on_place
 from sumo_cohesion.social.place import SCALE as PLACE_SCALE
 from sumo_cohesion.social.settings import CohesionSettings, as_printed
-from sumo_cohesion.state import AgreementRow, Control, FloatArray, Observation, Plan
+from sumo_cohesion.state import Control, FloatArray, Observation, Plan
 
 if TYPE_CHECKING:
     from sumo_cohesion.planning.mpc import Mpc
@@ -140,8 +140,6 @@ class CohesivePlanner:
         driven: Control | None,
     ) -> Problem:
         horizon, ego = self.settings.horizon, observation.ego
-        # Where the ego will be if it keeps its speed: the road is looked up there.
-        pace = DT * ego.speed
         weight, target, transitions, pressure = _NOTHING, _NOTHING, 0, 0.0
         if groups:
             # The paper's cohesion is on the first transition.
@@ -157,7 +155,8 @@ class CohesivePlanner:
         return Problem(
             ego=ego,
             ego_size=observation.ego_size,
-            road=self._road.ahead([ego.s + pace * t for t in range(horizon + 1)], ego.d),
+            # Where the ego will be if it keeps its speed.
+            road=self._road.ahead(ego.s, ego.d, DT * ego.speed, horizon + 1),
             cars=nearest_cars(observation, self.settings.cars),
             cohesion_weight=weight,
             cohesion_target=target,
@@ -187,11 +186,10 @@ class CohesivePlanner:
         social_time: float,
     ) -> Plan:
         assert self._mpc is not None
-        rows = explain(observation, groups, place, self.cohesion.beta, self._road)
-        rest = self._mpc.rest
+        bend = self._road.bend_at(observation.ego.s)
         if solution.solved:
             controls, states = _controls(solution.controls), solution.states
-        elif rest is not None:
+        elif (rest := self._mpc.rest) is not None:
             controls, states = _controls(rest.controls), rest.states
         else:
             braking = fallback(observation, self._road, self.settings, solution.status)
@@ -206,7 +204,7 @@ class CohesivePlanner:
             wall_time=solution.wall_time,
             social_time=social_time,
             reward=solution.reward,
-            agreement=rows,
+            agreement=Explanation(observation.ego, bend, groups, place, self.cohesion.beta),
         )
 
 
@@ -224,41 +222,6 @@ def nearest_cars(observation: Observation, n: int) -> FloatArray:
 
 def _controls(rows: FloatArray) -> tuple[Control, ...]:
     return tuple([Control(c, a) for c, a in rows.tolist()])
-
-
-def explain(
-    observation: Observation,
-    groups: tuple[Agreement, ...],
-    place: Place,
-    beta: float,
-    road: Road,
-) -> tuple[AgreementRow, ...]:
-    """Say per group and feature what was agreed and what ignoring it would cost."""
-    if not groups:
-        return ()
-    s, d, heading, speed = observation.ego
-    curvature = road.bend_at(s)
-    on = (
-        s + DT * speed * cos(heading) / (1.0 - curvature * d),
-        d + DT * speed * sin(heading),
-        heading,
-        speed,
-    )
-    own = social_features(observation.ego, on, DT, curvature)
-    rows = [
-        AgreementRow(g.group, name, g.n, m, v, w, o, beta * w * (m - o) ** 2)
-        for g in groups
-        for name, m, v, w, o in zip(FEATURES, g.mean, g.variance, g.weight, own, strict=True)
-    ]
-    if any(place.weight):
-        # The nearest place that is known.
-        i = next(i for i, weight in enumerate(place.weight) if weight > 0.0)
-        mean, here, weight = place.mean[i] / PLACE_SCALE, d / PLACE_SCALE, place.weight[i]
-        pull = beta * weight * (mean - here) ** 2
-        rows.append(
-            AgreementRow("position", "place", place.n, mean, place.variance[i], weight, here, pull)
-        )
-    return tuple(rows)
 
 
 BUILT_IN = {

@@ -49,27 +49,28 @@ def checked(plan: Plan, observation: Observation, road: Road, settings: PlannerS
     hardest = settings.friction * ego.speed - min(settings.max_braking, ego.speed / DT)
     curvature, acceleration, reasons = control.curvature, control.acceleration, []
     own = _extent(ego.heading, observation.ego_size)
-    length, width = observation.ego_size
-    reach = safe_distance(after[3], 0.0, settings)
+    reach = safe_distance(after[3], 0.0, settings) + sum(observation.ego_size) / 2
+    pace = 2.0 * DT * after[3]
     sizes = observation.sizes.tolist()
     for i, (s, d, heading, speed) in enumerate(observation.states.tolist()):
         size = sizes[i]
-        # Far away however they are turned, and wherever they are a step from now: most are.
-        near = 0.5 * (length + width + size[0] + size[1]) + 2.0 * DT * (after[3] + speed)
-        if not -near < s - ego.s < near + reach or abs(d - ego.d) > near + SIDE_MARGIN:
+        # Far away however it is turned, and wherever it is a step from now.
+        if abs(s - ego.s) > reach + pace + 2.0 * DT * speed + (size[0] + size[1]) / 2:
+            continue
+        # The next lane but one, or a car straight beside in the next one: most are.
+        other = _extent(heading, size)
+        aside = abs(d + DT * speed * sin(heading) - after[1]) - own[1] - other[1]
+        if aside >= SIDE_MARGIN:
             continue
         stretch = 1.0 - float(observation.curvature[i]) * d
-        other = _extent(heading, size)
-        along, across = speed * cos(heading), speed * sin(heading)
+        along = speed * cos(heading)
         ahead = s + DT * along / stretch - after[0] - own[0] - other[0]
-        aside = abs(d + DT * across - after[1]) - own[1] - other[1]
-        behind = s > ego.s and aside < 0.0
-        if behind and ahead < safe_distance(after[3], along, settings):
+        if s > ego.s and aside < 0.0 and ahead < safe_distance(after[3], along, settings):
             if acceleration > hardest + 1e-9:
                 acceleration = hardest
                 reasons.append(f"too close behind {observation.ids[i]}")
             continue
-        if abs(s - ego.s) < own[0] + other[0] and aside < SIDE_MARGIN:
+        if abs(s - ego.s) < own[0] + other[0]:
             straight = min(curvature, level) if d > ego.d else max(curvature, level)
             if straight != curvature:
                 curvature = straight

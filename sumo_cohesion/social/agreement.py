@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import repeat
+from operator import mul
 from typing import NamedTuple
 
 from sumo_cohesion.perception.habit import Features
@@ -49,18 +51,11 @@ def _agree(group: str, votes: Sequence[Vote], settings: CohesionSettings) -> Agr
         return Agreement(group, n, _ZEROS, _ZEROS, _ZEROS)
     features, habits = zip(*votes, strict=True)
     floor = settings.variance_floor
-    columns = [
-        estimate(values, habit, floor)
-        for values, habit in zip(
-            zip(*features, strict=True), zip(*habits, strict=True), strict=True
-        )
-    ]
+    columns = map(estimate, zip(*features, strict=True), zip(*habits, strict=True), repeat(floor))
     mean, variance = zip(*columns, strict=True)
+    share = 1.0, settings.speed_weight
     weight = tuple(
-        [
-            (1.0 if lateral else settings.speed_weight) / (v + floor)
-            for v, lateral in zip(variance, LATERAL, strict=True)
-        ]
+        [share[not steers] / (v + floor) for v, steers in zip(variance, LATERAL, strict=True)]
     )
     return Agreement(group, n, mean, variance, weight)
 
@@ -91,11 +86,10 @@ def estimate(values: Sequence[float], habits: Sequence[float], floor: float) -> 
 
 def combine(groups: Sequence[Agreement]) -> CohesionTerm:
     """Sum the groups' terms into one weight and one target per feature."""
-    weights = list(zip(*[g.weight for g in groups], strict=True))
-    means = list(zip(*[g.mean for g in groups], strict=True))
-    total = [sum(w) for w in weights]
-    target = [
-        sum([wi * mi for wi, mi in zip(w, m, strict=True)]) / t if t > 0.0 else 0.0
-        for w, m, t in zip(weights, means, total, strict=True)
-    ]
+    weights = zip(*[g.weight for g in groups], strict=True)
+    means = zip(*[g.mean for g in groups], strict=True)
+    total, target = [], []
+    for weight, mean in zip(weights, means, strict=True):
+        total.append(t := sum(weight))
+        target.append(sum(map(mul, weight, mean)) / t if t > 0.0 else 0.0)
     return CohesionTerm(tuple(total), tuple(target))

@@ -10,6 +10,7 @@ and if none does there is nothing to follow sideways.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from operator import mul
 
 from sumo_cohesion.social.agreement import Agreement
 from sumo_cohesion.social.features import LATERAL
@@ -17,6 +18,7 @@ from sumo_cohesion.social.place import Place
 from sumo_cohesion.social.settings import CohesionSettings
 
 _STEERING = [i for i, lateral in enumerate(LATERAL) if lateral]
+_NOT_STEERING = [float(not lateral) for lateral in LATERAL]
 _STILL_NEWS = 1.0
 """Surprise that is enough as long as a greater one is remembered."""
 
@@ -64,7 +66,5 @@ def surprise_of(group: Agreement, place: Place) -> float:
 
 
 def _silent(group: Agreement) -> Agreement:
-    weight = tuple(
-        [0.0 if lateral else w for w, lateral in zip(group.weight, LATERAL, strict=True)]
-    )
+    weight = tuple(map(mul, group.weight, _NOT_STEERING))
     return Agreement(group.group, group.n, group.mean, group.variance, weight)

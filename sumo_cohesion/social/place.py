@@ -57,16 +57,17 @@ def agree_on_place(
     companions = _companions(ego, history, settings)
     if len(companions) < settings.min_cars:
         return NOWHERE
+    places = [ego.s + time * ego.speed for time in times]
+    found: list[tuple[list[float], list[float]]] = [([], []) for _ in places]
+    for track, habit in companions:
+        for (across, habits), d in zip(found, track.across_all(places), strict=False):
+            across.append(d / SCALE)
+            habits.append(habit)
     rows, surprise = [], 0.0
-    for time in times:
-        s = ego.s + time * ego.speed
-        found = [
-            (d / SCALE, habit) for track, habit in companions if (d := track.across(s)) is not None
-        ]
-        if len(found) < settings.min_cars:
+    for s, (across, habits) in zip(places, found, strict=True):
+        if len(across) < settings.min_cars:
             rows.append((ego.d, 0.0, 0.0))
             continue
-        across, habits = zip(*found, strict=True)
         mean, variance = estimate(across, habits, settings.variance_floor)
         mean *= SCALE
         weight = settings.place_weight / (variance + settings.variance_floor)
@@ -89,11 +90,12 @@ def _companions(
     are asked about. It stands for how little their place can be relied on, though it is one of
     lateral speeds.
     """
-    path = history.ego_path
+    path, width = history.ego_path, settings.position_width
+    farthest = max(ego.s - settings.place_look_back, path.first)
     companions = []
     for track in history.passed(ego.s):
-        s = max(ego.s - settings.place_look_back, path.first, track.middle_s[0])
+        s = max(farthest, track.middle_s[0])
         d = track.across(s)
-        if d is not None and abs(d - path.at(s)) <= settings.position_width:
+        if d is not None and abs(d - path.at(s)) <= width:
             companions.append((track, track.habit_at(s)[_LATERAL]))
     return companions

@@ -205,7 +205,7 @@ def test_beta_zero_is_the_nominal_planner(highway: Road) -> None:
     planner.reset(highway)
     a, b = planner.plan(scene, history), nominal(highway).plan(scene, history)
     assert np.array_equal(a.states, b.states)
-    assert a.agreement == ()
+    assert list(a.agreement) == []
 
 
 def test_warm_start_shifts_time_not_controls() -> None:

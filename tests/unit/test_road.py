@@ -130,7 +130,7 @@ def test_ahead_keeps_to_the_routes_own_branch_where_a_lane_splits(way: str) -> N
     road = Network(ROOT / "networks" / "exit.net.xml").road(("before", way))
     places = np.arange(1000.0, 1100.0, 5.0)
     right_lane = float(np.nanmin(road.lanes_at(900.0)))
-    ahead = road.ahead(places.tolist(), right_lane)
+    ahead = road.ahead(1000.0, right_lane, 5.0, len(places))
     route = road.lanes_at(places)[:, : road.n_route_lanes]
     own = route[np.arange(len(places)), np.nanargmin(np.abs(route - right_lane), axis=1)]
     assert np.abs(own - right_lane).max() < 0.3
@@ -152,11 +152,10 @@ def test_ahead_is_the_same_with_and_without_the_short_cut(d: float) -> None:
     road = Network(ROOT / "networks" / "exit.net.xml").road(("before", "after"))
     middle = float(np.nanmean(road.lanes_at(900.0)))
     for start in np.arange(0.0, road.length, 37.0):
-        places = (start + np.arange(0.0, 30.0, 3.0)).tolist()
-        whole = road.ahead(places, middle + d)
+        whole = road.ahead(start, middle + d, 3.0, 10)
         looked_up, followed = [], middle + d
-        for place in places:
-            one = road.ahead([place], followed)
+        for place in start + np.arange(0.0, 30.0, 3.0):
+            one = road.ahead(place, followed, 0.0, 1)
             lanes = one.rows[0, : road.lane_centre.shape[1]]
             followed = lanes[np.abs(lanes - followed).argmin()]
             looked_up.append(np.concatenate((one.rows[0], one.edges[0])))
