@@ -39,7 +39,6 @@ from sumo_cohesion.experiments.rollout import versions
 from sumo_cohesion.experiments.setup import prepare
 from sumo_cohesion.experiments.simulation import simulate
 from sumo_cohesion.planning import mpc as mpc_module
-from sumo_cohesion.planning.instance import Desk
 from sumo_cohesion.planning.mpc import Mpc, shifted
 from sumo_cohesion.planning.nlp import roll_out
 from sumo_cohesion.planning.planners import make_planner
@@ -53,6 +52,7 @@ from sumo_cohesion.planning.stage import (
     make_stage,
     rate_excess,
 )
+from sumo_cohesion.planning.transcription import Transcription
 
 OURS = "ours, compiled"
 REPEATS = 3
@@ -310,8 +310,8 @@ def compare(horizon: int, n: int) -> pd.DataFrame:
     problems = record(horizon, n)
     n_lanes = max(map(lanes_of, problems))
     problems = [problem for problem in problems if lanes_of(problem) == n_lanes]
-    host, desk = Mpc(settings, n_lanes), Desk(settings, n_lanes)
-    instances = [copy.deepcopy(desk.write(problem)) for problem in problems]
+    host, transcription = Mpc(settings, n_lanes), Transcription(settings, n_lanes)
+    instances = [copy.deepcopy(transcription.write(problem)) for problem in problems]
     judge, rows = Judge(settings, n_lanes), []
     built = methods(settings, n_lanes)
     warm: dict[str, np.ndarray] = {}

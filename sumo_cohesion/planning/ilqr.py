@@ -215,10 +215,9 @@ def _riccati_step(stage: Stage, settings: PlannerSettings, *, exact: bool) -> An
     """One stage of the backward pass: the cost-to-go before it, from the one after it."""
     n = N_STATES
     gradient, hessian = ca.SX.sym("gradient", n), ca.SX.sym("hessian", n, n)
-    given_hessian, hessian = hessian, _symmetric(hessian)
     low, high, most = (ca.SX.sym(name, 2) for name in ("low", "high", "most"))
     mu = ca.SX.sym("mu")
-    slope, model = _quadratic(stage, gradient, hessian, exact=exact)
+    slope, model = _quadratic(stage, gradient, _symmetric(hessian), exact=exact)
     xx, ux, uu = model[:n, :n], model[n:, :n], model[n:, n:]
     x_slope, u_slope = slope[:n], slope[n:]
 
@@ -236,7 +235,7 @@ def _riccati_step(stage: Stage, settings: PlannerSettings, *, exact: bool) -> An
     change = ca.dot(step, u_slope) + 0.5 * ca.dot(step, uu @ step)
     return ca.Function(
         "riccati_exact" if exact else "riccati_gauss_newton",
-        [gradient, given_hessian, *stage.inputs(), low, high, most, mu],
+        [gradient, hessian, *stage.inputs(), low, high, most, mu],
         [
             gradient_before,
             _symmetric(hessian_before),

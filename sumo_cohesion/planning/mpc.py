@@ -13,11 +13,11 @@ from typing import Protocol
 import numpy as np
 
 from sumo_cohesion.planning.ilqr import Ilqr
-from sumo_cohesion.planning.instance import shared_desk
 from sumo_cohesion.planning.lbfgs import Lbfgs
 from sumo_cohesion.planning.nlp import InteriorPoint
 from sumo_cohesion.planning.problem import Instance, Problem, Solution
 from sumo_cohesion.planning.settings import PlannerSettings
+from sumo_cohesion.planning.transcription import shared_transcription
 from sumo_cohesion.state import RESCUED, FloatArray
 
 
@@ -58,7 +58,7 @@ class Mpc:
         self.settings = settings
         self.n_lanes = n_lanes
         self.solver = shared_solver(settings.solver, settings, n_lanes)
-        self._desk = shared_desk(settings, n_lanes)
+        self._transcription = shared_transcription(settings, n_lanes)
         self._last: Solution | None = None
         self._warm = False
         self._age = 0
@@ -87,7 +87,7 @@ class Mpc:
     def solve(self, problem: Problem) -> Solution:
         """Solve one instance; never raises for a solver's failure, see ``solved``."""
         self._age += 1
-        instance = self._desk.write(problem)
+        instance = self._transcription.write(problem)
         if instance is None:
             # Some solvers never return from a problem that is not a number.
             return _failed("input is not finite")
@@ -109,7 +109,7 @@ class Mpc:
             raise  # nothing else would work either
         except Exception as error:
             return _failed(f"{solver.name} raised {type(error).__name__}: {error}")
-        if solution.solved and not self._desk.is_solution(solution):
+        if solution.solved and not self._transcription.is_solution(solution):
             return _failed(f"{solver.name} returned garbage", solution)
         return solution
 

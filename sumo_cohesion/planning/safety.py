@@ -57,7 +57,7 @@ def checked(plan: Plan, observation: Observation, road: Road, settings: PlannerS
         # Far away however it is turned, and wherever it is a step from now.
         if abs(s - ego.s) > reach + pace + 2.0 * DT * speed + (size[0] + size[1]) / 2:
             continue
-        # The next lane but one, or a car straight beside in the next one: most are.
+        # Beside the ego's way with room to spare.
         other = _extent(heading, size)
         aside = abs(d + DT * speed * sin(heading) - after[1]) - own[1] - other[1]
         if aside >= SIDE_MARGIN:

@@ -53,9 +53,11 @@ def _agree(group: str, votes: Sequence[Vote], settings: CohesionSettings) -> Agr
     floor = settings.variance_floor
     columns = map(estimate, zip(*features, strict=True), zip(*habits, strict=True), repeat(floor))
     mean, variance = zip(*columns, strict=True)
-    share = 1.0, settings.speed_weight
     weight = tuple(
-        [share[not steers] / (v + floor) for v, steers in zip(variance, LATERAL, strict=True)]
+        [
+            (1.0 if lateral else settings.speed_weight) / (v + floor)
+            for v, lateral in zip(variance, LATERAL, strict=True)
+        ]
     )
     return Agreement(group, n, mean, variance, weight)
 

@@ -18,11 +18,11 @@ from hypothesis import strategies as st
 from sumo_cohesion.planning import compiled as compilation
 from sumo_cohesion.planning.dynamics import step
 from sumo_cohesion.planning.ilqr import _box_step
-from sumo_cohesion.planning.instance import Desk
 from sumo_cohesion.planning.mpc import SOLVERS, Mpc
 from sumo_cohesion.planning.problem import FAR_AWAY, Problem, Solution
 from sumo_cohesion.planning.settings import PlannerSettings
 from sumo_cohesion.planning.stage import UNLIMITED, StageParameters, make_stage
+from sumo_cohesion.planning.transcription import Transcription
 from sumo_cohesion.road import RoadAhead
 from sumo_cohesion.state import Control, RoadState
 from tests.conftest import ROOT
@@ -99,10 +99,10 @@ def test_squares_have_the_gradient_of_the_cost_and_are_never_negative() -> None:
         [z, stage.parameters],
         [ca.gradient(cost, z), jacobian.T @ (weights * residuals), weights],
     )
-    desk = Desk(SETTINGS, 3)
+    transcription = Transcription(SETTINGS, 3)
     for seed in range(50):
         asked = problem(seed)
-        instance = desk.write(asked)
+        instance = transcription.write(asked)
         assert instance is not None
         control = np.random.default_rng(seed).normal(size=4)
         exact, squares, weights = (
@@ -119,12 +119,12 @@ def part(rows: np.ndarray, name: str) -> np.ndarray:
 
 
 def test_what_solvers_read_is_what_is_known() -> None:
-    desk, asked = Desk(SETTINGS, 3), problem(7)
+    transcription, asked = Transcription(SETTINGS, 3), problem(7)
     car = (130.0, 3.0, 0.1, 20.0, 12.0, 2.4, 0.004)
     road = straight_road(10)
     road.rows[:, 0], road.rows[3:, -2], road.rows[:, -1] = np.inf, 30.0, 0.001 * np.arange(11)
     asked = replace(asked, cars=np.array([car]), road=road, transitions=4)
-    instance = desk.write(asked)
+    instance = transcription.write(asked)
     assert instance is not None
     rows, time = instance.stages, 0.1 * np.arange(1, 11)
     cars = part(rows, "cars").reshape(10, SETTINGS.cars, 6)
@@ -146,15 +146,15 @@ def test_what_solvers_read_is_what_is_known() -> None:
 
 
 def test_the_change_of_the_first_control_is_bounded_if_one_was_driven() -> None:
-    desk, asked = Desk(SETTINGS, 3), problem(7)
+    transcription, asked = Transcription(SETTINGS, 3), problem(7)
     ego = RoadState(100.0, 0.0, 0.0, 20.0)
-    free = desk.write(replace(asked, ego=ego, driven=None))
+    free = transcription.write(replace(asked, ego=ego, driven=None))
     assert free is not None
     assert (free.change[0] == UNLIMITED).all()
     assert (free.start[4:] == 0.0).all()
     most = 0.1 * SETTINGS.max_curvature_rate / 0.01, 0.1 * SETTINGS.max_jerk / 5.0
     assert free.change[1] == pytest.approx(most)
-    bound = desk.write(replace(asked, ego=ego, driven=Control(0.002, -50.0)))
+    bound = transcription.write(replace(asked, ego=ego, driven=Control(0.002, -50.0)))
     assert bound is not None
     assert bound.change[0] == pytest.approx(most)
     # Braking harder than is allowed now would leave nothing to choose.
@@ -163,29 +163,29 @@ def test_the_change_of_the_first_control_is_bounded_if_one_was_driven() -> None:
 
 
 def test_what_cannot_be_a_solution_is_found_out() -> None:
-    desk, asked = Desk(SETTINGS, 3), problem(7)
+    transcription, asked = Transcription(SETTINGS, 3), problem(7)
     mpc = Mpc(SETTINGS, 3)
     good = mpc.solve(asked)
-    assert desk.write(asked) is not None
-    assert desk.is_solution(good)
+    assert transcription.write(asked) is not None
+    assert transcription.is_solution(good)
     states, controls = good.states, good.controls
     wrong = np.zeros_like(states)
     for row in (0, 1):
         for column in range(4):
             wrong[:] = 0.0
             wrong[row, column] = 0.002
-            assert not desk.is_solution(replace(good, states=states + wrong))
+            assert not transcription.is_solution(replace(good, states=states + wrong))
     for value in (np.nan, np.inf, 0.02):
         for row in (0, 9):
             broken = controls.copy()
             broken[row, 0] = value
-            assert not desk.is_solution(replace(good, controls=broken))
+            assert not transcription.is_solution(replace(good, controls=broken))
     for value in (np.nan, np.inf, -np.inf):
         broken = states.copy()
         broken[7, 1] = value
-        assert not desk.is_solution(replace(good, states=broken))
-    assert not desk.is_solution(replace(good, states=states[:-1]))
-    assert not desk.is_solution(replace(good, controls=controls[:-1]))
+        assert not transcription.is_solution(replace(good, states=broken))
+    assert not transcription.is_solution(replace(good, states=states[:-1]))
+    assert not transcription.is_solution(replace(good, controls=controls[:-1]))
 
 
 def test_the_box_problem_is_solved_exactly() -> None:
@@ -355,7 +355,9 @@ def test_compiled_or_not_the_plans_are_the_same_bit_for_bit(tmp_path: Path) -> N
         pytest.skip("no C compiler here")
     how, fast = plans(XDG_CACHE_HOME=str(tmp_path))
     assert how == "compiled"
-    assert len(list((tmp_path / "sumo-cohesion").glob("*.so"))) == 2  # the solver, the desk
+    assert (
+        len(list((tmp_path / "sumo-cohesion").glob("*.so"))) == 2
+    )  # the solver, the transcription
     how, slow = plans(SUMO_COHESION_COMPILE="0")
     assert how == "not compiled: SUMO_COHESION_COMPILE is 0"
     assert fast == slow
@@ -398,4 +400,6 @@ def test_many_processes_compile_once(tmp_path: Path) -> None:
     said = [process.communicate()[0] for process in processes]
     assert all(text.startswith("compiled") for text in said)
     assert len(set(said)) == 1
-    assert len(list((tmp_path / "sumo-cohesion").glob("*.so"))) == 2  # the solver, the desk
+    assert (
+        len(list((tmp_path / "sumo-cohesion").glob("*.so"))) == 2
+    )  # the solver, the transcription

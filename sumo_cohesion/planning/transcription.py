@@ -50,12 +50,12 @@ _HAIR = 1e-3
 
 
 @lru_cache(maxsize=32)
-def shared_desk(settings: PlannerSettings, n_lanes: int) -> Desk:
-    """Return a desk, built once per process: it remembers nothing between two plans."""
-    return Desk(settings, n_lanes)
+def shared_transcription(settings: PlannerSettings, n_lanes: int) -> Transcription:
+    """Return a transcription, built once per process: it remembers nothing between two plans."""
+    return Transcription(settings, n_lanes)
 
 
-class Desk:
+class Transcription:
     """Writes the instances of problems of one shape, and checks their solutions.
 
     Roads have up to ``n_lanes`` lanes.
