@@ -122,8 +122,7 @@ def simulate(setup: Setup, planner: Planner, *, gui: bool = False) -> Rollout:
             at_end = observation.ego.s > road.length - END_OF_ROUTE
             outcome = _outcome(bool(touched.size), at_end, scene.time > end - STEP_LENGTH / 2)
         fleet.meet(scene, sumo)  # who touched whom in the last step
-        names = [scene.ids[i] for i in touched]
-        told = sumo.reported_contacts()
+        names, told = [scene.ids[i] for i in touched], sumo.reported_contacts()
         return recorder.finish(
             scene, Ending(outcome, names, told, drivers.triggered, fleet.summary())
         )
