@@ -90,19 +90,13 @@ class Peer:
 
     def __init__(self, settings: PlannerSettings, n_lanes: int) -> None:
         self.settings = settings
-        layout = StageParameters(settings, n_lanes)
-        stage = make_stage(settings, layout)
+        stage = make_stage(settings, StageParameters(settings, n_lanes))
         self.step = ca.Function("step", stage.inputs(), [stage.next_state])
         self.cost = ca.Function("cost", stage.inputs(), stage.landed(stage.cost))
         most = ca.SX.sym("most", 2)
         excess = rate_excess(stage.state, stage.control, most, settings)
         self.rates = ca.Function("rates", [stage.state, stage.control, most], [excess])
         self.n_parameters = stage.parameters.shape[0]
-        self._bends = layout.columns("road_curvature")
-
-    def states(self, instance: Instance, guess: np.ndarray) -> np.ndarray:
-        """States that guessed controls lead to, (T + 1, 6)."""
-        return roll_out(instance, guess, self._bends, self.settings.friction)
 
 
 class DoMpc(Peer):
@@ -158,7 +152,9 @@ class DoMpc(Peer):
         self._x = np.array([at(whole["_x", k, 0, -1]) for k in range(t + 1)])
         self._template.master = 0.0
 
-    def solve(self, instance: Instance, guess: np.ndarray) -> tuple[np.ndarray, bool]:
+    def solve(
+        self, instance: Instance, guess: np.ndarray, states: np.ndarray
+    ) -> tuple[np.ndarray, bool]:
         controller, last = (
             self._controller,
             np.minimum(np.arange(self.settings.horizon + 1), self.settings.horizon - 1),
@@ -179,7 +175,7 @@ class DoMpc(Peer):
             bounds.master = ca.DM(flat)
         start = np.asarray(controller.opt_x_num.master).ravel().copy()
         start[self._u] = guess / CONTROL_SCALE
-        start[self._x] = self.states(instance, guess)
+        start[self._x] = states
         controller.opt_x_num.master = ca.DM(start)
         controller.x0 = instance.start
         controller.u0 = guess[0] / CONTROL_SCALE
@@ -226,9 +222,11 @@ class Rockit(Peer):
         given.append(ocp.value(start))
         self._function = ocp.to_function("solve", [*given, states, controls], [controls])
 
-    def solve(self, instance: Instance, guess: np.ndarray) -> tuple[np.ndarray, bool]:
+    def solve(
+        self, instance: Instance, guess: np.ndarray, states: np.ndarray
+    ) -> tuple[np.ndarray, bool]:
         given = (instance.stages, instance.change, instance.low, instance.high)
-        start = (self.states(instance, guess).T, (guess / CONTROL_SCALE).T)
+        start = (states.T, (guess / CONTROL_SCALE).T)
         try:
             found = self._function(*[rows.T for rows in given], instance.start, *start)
         except RuntimeError:
@@ -244,7 +242,10 @@ class Ours:
         self._solver = mpc_module.SOLVERS[name](chosen, n_lanes)
         self.how = self._solver.how
 
-    def solve(self, instance: Instance, guess: np.ndarray) -> tuple[np.ndarray, bool]:
+    def solve(
+        self, instance: Instance, guess: np.ndarray, states: np.ndarray
+    ) -> tuple[np.ndarray, bool]:
+        del states  # our solvers roll them out themselves
         solution = self._solver.solve(instance, guess)
         if not solution.solved:
             return np.full(instance.low.shape, np.nan), False
@@ -312,6 +313,7 @@ def compare(horizon: int, n: int) -> pd.DataFrame:
     problems = [problem for problem in problems if lanes_of(problem) == n_lanes]
     host, transcription = Mpc(settings, n_lanes), Transcription(settings, n_lanes)
     instances = [copy.deepcopy(transcription.write(problem)) for problem in problems]
+    bends = StageParameters(settings, n_lanes).columns("road_curvature")
     judge, rows = Judge(settings, n_lanes), []
     built = methods(settings, n_lanes)
     warm: dict[str, np.ndarray] = {}
@@ -322,10 +324,11 @@ def compare(horizon: int, n: int) -> pd.DataFrame:
         for name in order:
             for start in ("cold", "warm"):
                 guess = hold if start == "cold" else warm.get(name, hold)
+                states = roll_out(instance, guess, bends, settings.friction)
                 took = []
                 for _ in range(REPEATS):
                     begin = time.process_time()
-                    controls, solved = built[name].solve(instance, guess)
+                    controls, solved = built[name].solve(instance, guess, states)
                     took.append(1e3 * (time.process_time() - begin))
                 value = judge.reward(instance, controls) if solved else np.nan
                 ms = float(np.median(took))

@@ -132,7 +132,7 @@ class Road:
         return np.asarray(distance.argmin(axis=-1))
 
     def lane_of(self, s: float, d: float) -> int:
-        """Return lane_index of one point: scalar arithmetic, faster than arrays."""
+        """Return lane_index of one point, faster; half-way between two lanes, the right one."""
         vertex = min(max(round((s - self.s0) / SPACING), 0), self.x.size - 1)
         borders, lanes = self._borders[vertex]
         return lanes[bisect_left(borders, d)]

@@ -112,6 +112,8 @@ class Observation:
 
     def __post_init__(self) -> None:
         _require_finite("Observation.states", self.states, (len(self.ids), 4))
+        if len(self.voter) != len(self.ids):
+            raise ValueError(f"Observation.voter must have {len(self.ids)} flags")
         if not isfinite(sum(self.ego)):
             raise ValueError("Observation.ego holds a number that is not finite")
 

@@ -138,6 +138,7 @@ def _older_objects_left_alone() -> Iterator[None]:
     if gc.get_freeze_count():  # somebody else's
         yield
         return
+    gc.collect()  # or what earlier runs left would stay, too
     gc.freeze()
     try:
         yield

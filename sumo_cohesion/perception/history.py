@@ -100,25 +100,16 @@ class Track:
             return self.features[-1]
         return None
 
-    def across(self, s: float) -> float | None:
-        """Where across the road (d, m) the car was when it passed s; None if that is unknown."""
-        middle_s, middle_d = self.middle_s, self.middle_d
-        after = bisect_right(middle_s, s)
-        if after == 0 or after == len(middle_s):
-            return None
-        s0, d0 = middle_s[after - 1], middle_d[after - 1]
-        return d0 + (middle_d[after] - d0) * (s - s0) / (middle_s[after] - s0)
+    def across(self, places: Sequence[float]) -> list[float]:
+        """Where across the road (d, m) the car was when it passed some places s (m).
 
-    def across_all(self, places: Sequence[float]) -> list[float]:
-        """Where across the road (m) the car was at places ahead of one it has passed.
-
-        ``places`` (m) ascend; as many are answered as the car has passed.
+        Up to the first place of which that is not known.
         """
         middle_s, middle_d = self.middle_s, self.middle_d
-        after, n, found = 0, len(middle_s), []
+        n, found = len(middle_s), []
         for s in places:
-            after = bisect_right(middle_s, s, after)
-            if after == n:
+            after = bisect_right(middle_s, s)
+            if not 0 < after < n:
                 break
             s0, d0 = middle_s[after - 1], middle_d[after - 1]
             found.append(d0 + (middle_d[after] - d0) * (s - s0) / (middle_s[after] - s0))

@@ -22,7 +22,7 @@ class Explanation(Sequence[AgreementRow]):
     Attributes
     ----------
     ego, bend : the ego's road state, and the road's curvature (1/m) there.
-    groups, place : what was agreed, as it steered.
+    groups, place : what was agreed, as it steered; at least one group.
     beta : the cohesion's trade-off.
     """
 
@@ -67,8 +67,6 @@ class Explanation(Sequence[AgreementRow]):
 
     def rows(self) -> list[AgreementRow]:
         """Return one row per group and feature, and one for the place if there is one."""
-        if not self.groups:
-            return []
         return [AgreementRow(*row) for row in zip(*self.columns(), strict=True)]
 
     def __len__(self) -> int:

@@ -69,12 +69,15 @@ class Mpc:
         return f"{self.solver.name}, {self.solver.how}"
 
     @property
-    def rest(self) -> Solution | None:
-        """What is left of the last solution after a failure, while that is more than half of it."""
+    def rest(self) -> tuple[FloatArray, FloatArray] | None:
+        """What is left of the last solution after a failure, while that is more than half of it.
+
+        States and controls.
+        """
         last, age = self._last, self._age
         if last is None or 2 * (self.settings.horizon - age) <= self.settings.horizon:
             return None
-        return replace(last, states=last.states[age:], controls=last.controls[age:])
+        return last.states[age:], last.controls[age:]
 
     def drop_rest(self) -> None:
         """Forget what is left of the last solution: the ego has not driven along it."""

@@ -186,11 +186,13 @@ class CohesivePlanner:
         social_time: float,
     ) -> Plan:
         assert self._mpc is not None
-        bend = self._road.bend_at(observation.ego.s)
+        ego, why = observation.ego, None
+        if groups:
+            why = Explanation(ego, self._road.bend_at(ego.s), groups, place, self.cohesion.beta)
         if solution.solved:
             controls, states = _controls(solution.controls), solution.states
         elif (rest := self._mpc.rest) is not None:
-            controls, states = _controls(rest.controls), rest.states
+            controls, states = _controls(rest[1]), rest[0]
         else:
             braking = fallback(observation, self._road, self.settings, solution.status)
             controls, states = braking.controls, braking.states
@@ -204,7 +206,7 @@ class CohesivePlanner:
             wall_time=solution.wall_time,
             social_time=social_time,
             reward=solution.reward,
-            agreement=Explanation(observation.ego, bend, groups, place, self.cohesion.beta),
+            agreement=why or (),
         )
 
 

@@ -50,14 +50,17 @@ def checked(plan: Plan, observation: Observation, road: Road, settings: PlannerS
     curvature, acceleration, reasons = control.curvature, control.acceleration, []
     own = _extent(ego.heading, observation.ego_size)
     reach = safe_distance(after[3], 0.0, settings) + sum(observation.ego_size) / 2
-    pace = 2.0 * DT * after[3]
+    pace, clear = 2.0 * DT * after[3], own[1] + SIDE_MARGIN
     sizes = observation.sizes.tolist()
     for i, (s, d, heading, speed) in enumerate(observation.states.tolist()):
         size = sizes[i]
+        # As |sin h| <= |h| and cos h <= 1, the car is at least so far aside: most need no more.
+        turned = abs(heading) * (size[0] / 2 + DT * abs(speed))
+        if abs(d - after[1]) - turned - size[1] / 2 > clear:
+            continue
         # Far away however it is turned, and wherever it is a step from now.
         if abs(s - ego.s) > reach + pace + 2.0 * DT * speed + (size[0] + size[1]) / 2:
             continue
-        # Beside the ego's way with room to spare.
         other = _extent(heading, size)
         aside = abs(d + DT * speed * sin(heading) - after[1]) - own[1] - other[1]
         if aside >= SIDE_MARGIN:

@@ -51,7 +51,10 @@ _HAIR = 1e-3
 
 @lru_cache(maxsize=32)
 def shared_transcription(settings: PlannerSettings, n_lanes: int) -> Transcription:
-    """Return a transcription, built once per process: it remembers nothing between two plans."""
+    """Return a transcription, built once per process.
+
+    One plan after the other: writing, solving and checking must not be interleaved.
+    """
     return Transcription(settings, n_lanes)
 
 
@@ -64,7 +67,7 @@ class Transcription:
     def __init__(self, settings: PlannerSettings, n_lanes: int) -> None:
         self._settings = settings
         layout = StageParameters(settings, n_lanes)
-        functions, self.how = compiled([_write(settings, layout), _check(settings, layout)])
+        functions, _ = compiled([_write(settings, layout), _check(settings, layout)])
         self._allocate(layout, *functions)
 
     def _allocate(self, layout: StageParameters, write: Any, check: Any) -> None:
@@ -103,8 +106,8 @@ class Transcription:
             *problem.cohesion_weight,
             *problem.cohesion_target,
         )
-        n = len(problem.cars)
-        self._cars[:n], self._cars[n:] = problem.cars, _NO_CAR
+        cars = problem.cars[: len(self._cars)]
+        self._cars[: len(cars)], self._cars[len(cars) :] = cars, _NO_CAR
         self._road[:], self._edges[:] = problem.road
         self._place[0], self._place[1] = problem.place_weight, problem.place_target
         self._write()
@@ -215,7 +218,7 @@ def control_bounds(limits: dict[str, Any], friction: float, speed: Any, i: Any) 
 
     Braking and acceleration are bounded as what they do to the speed, friction included. Curvature
     is bounded so that the lateral acceleration keeps to its bound however fast the ego may be by
-    then.
+    then: as in PlannerSettings.sharpest, which is for numbers.
     """
     drag = friction * speed
     fastest = ca.fmax(speed + DT * limits["max_acceleration"] * (i + 1), 1e-3)

@@ -64,10 +64,14 @@ def _vote_at_place(
 ) -> Vote | None:
     """Mean features of those transitions that are near d (m), too; None if none is."""
     width, across = settings.position_width, track.middle_d[passed.start : passed.stop]
-    features, first = track.features[passed.start : passed.stop], passed.start
     if not across:
         return None
-    if max(across) - d > width or d - min(across) > width:
+    least, most = min(across) - d, max(across) - d
+    if least > width or most < -width:
+        return None
+    if -width <= least and most <= width:
+        features, first = track.features[passed.start : passed.stop], passed.start
+    else:
         here = [i for i in passed if abs(track.middle_d[i] - d) <= width]
         if not here:
             return None

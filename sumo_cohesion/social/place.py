@@ -60,7 +60,7 @@ def agree_on_place(
     places = [ego.s + time * ego.speed for time in times]
     found: list[tuple[list[float], list[float]]] = [([], []) for _ in places]
     for track, habit in companions:
-        for (across, habits), d in zip(found, track.across_all(places), strict=False):
+        for (across, habits), d in zip(found, track.across(places), strict=False):
             across.append(d / SCALE)
             habits.append(habit)
     rows, surprise = [], 0.0
@@ -90,12 +90,15 @@ def _companions(
     are asked about. It stands for how little their place can be relied on, though it is one of
     lateral speeds.
     """
+    tracks = history.passed(ego.s)
+    if not tracks:
+        return []
     path, width = history.ego_path, settings.position_width
     farthest = max(ego.s - settings.place_look_back, path.first)
     companions = []
-    for track in history.passed(ego.s):
+    for track in tracks:
         s = max(farthest, track.middle_s[0])
-        d = track.across(s)
-        if d is not None and abs(d - path.at(s)) <= width:
+        d = track.across([s])
+        if d and abs(d[0] - path.at(s)) <= width:
             companions.append((track, track.habit_at(s)[_LATERAL]))
     return companions

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from math import cos, sin
 
@@ -18,6 +19,7 @@ from sumo_cohesion.planning.planners import (
     Planner,
     SumoDriver,
     make_planner,
+    nearest_cars,
 )
 from sumo_cohesion.planning.settings import PlannerSettings
 from sumo_cohesion.road import Road
@@ -206,6 +208,38 @@ def test_beta_zero_is_the_nominal_planner(highway: Road) -> None:
     a, b = planner.plan(scene, history), nominal(highway).plan(scene, history)
     assert np.array_equal(a.states, b.states)
     assert list(a.agreement) == []
+
+
+def test_a_planner_asked_before_it_has_seen_anything_plans(highway: Road) -> None:
+    planner = CohesivePlanner(SETTINGS, CohesionSettings())
+    planner.reset(highway)
+    plan = planner.plan(observation((300.0, 0.0, 0.0, 25.0), []), empty_history())
+    assert plan.status == "solved"
+    assert all(row.n == 0 for row in plan.agreement)
+
+
+def test_an_explanation_is_a_sequence_of_rows(highway: Road) -> None:
+    scene, history = agreeing_history(1.0)
+    planner = CohesivePlanner(SETTINGS, CohesionSettings())
+    planner.reset(highway)
+    why = planner.plan(scene, history).agreement
+    rows = list(why)
+    assert len(why) == len(rows) >= 15
+    assert (why[0], why[-1], why[1:3]) == (rows[0], rows[-1], rows[1:3])
+    assert [list(column) for column in zip(*rows, strict=True)] == list(why.columns())
+
+
+def test_only_the_nearest_cars_count_and_their_order_does_not(highway: Road) -> None:
+    cars = [(300.0 + 7.0 * i, 3.5 * (i % 3), 0.0, 20.0) for i in range(1, 30)]
+    scene = observation((300.0, 0.0, 0.0, 25.0), cars)
+    near = nearest_cars(scene, 8)
+    assert near[:, :4].tolist() == [list(car) for car in sorted(cars, key=distance_to(scene))[:8]]
+    assert near[:, 4:].tolist() == [[*CAR, 0.0]] * 8
+    assert len(nearest_cars(observation((0.0, 0.0, 0.0, 1.0), cars[:3]), 8)) == 3
+
+
+def distance_to(scene: Observation) -> Callable[[tuple[float, float, float, float]], float]:
+    return lambda car: (car[0] - scene.ego.s) ** 2 + (car[1] - scene.ego.d) ** 2
 
 
 def test_warm_start_shifts_time_not_controls() -> None:

@@ -148,15 +148,29 @@ def test_ahead_keeps_to_the_routes_own_branch_where_a_lane_splits(way: str) -> N
 
 @pytest.mark.parametrize("d", [-4.0, 0.0, 4.0])
 def test_ahead_is_the_same_with_and_without_the_short_cut(d: float) -> None:
-    """Where nothing changes one look is enough: on every stretch as on a stretch of one place."""
-    road = Network(ROOT / "networks" / "exit.net.xml").road(("before", "after"))
+    """One look is enough where nothing changes, and only there."""
+    road, slow = (
+        Network(ROOT / "networks" / "exit.net.xml").road(("before", "after")) for _ in range(2)
+    )
+    slow._same_until[:] = [-1] * len(slow._same_until)
     middle = float(np.nanmean(road.lanes_at(900.0)))
+    short = 0
     for start in np.arange(0.0, road.length, 37.0):
-        whole = road.ahead(start, middle + d, 3.0, 10)
-        looked_up, followed = [], middle + d
-        for place in start + np.arange(0.0, 30.0, 3.0):
-            one = road.ahead(place, followed, 0.0, 1)
-            lanes = one.rows[0, : road.lane_centre.shape[1]]
-            followed = lanes[np.abs(lanes - followed).argmin()]
-            looked_up.append(np.concatenate((one.rows[0], one.edges[0])))
-        assert np.array_equal(np.hstack((whole.rows, whole.edges)), looked_up)
+        found = road.ahead(start, middle + d, 3.0, 10)
+        expected = slow.ahead(start, middle + d, 3.0, 10)
+        assert np.array_equal(found.rows, expected.rows)
+        assert np.array_equal(found.edges, expected.edges)
+        assert found.rows[:, -1] == pytest.approx(
+            road.curvature_at(start + np.arange(0.0, 30.0, 3.0))
+        )
+        short += found is road.ahead(start, middle + d, 3.0, 10)
+    assert 0 < short < road.length / 37.0
+
+
+def test_the_lane_of_one_point_is_the_lane_of_many() -> None:
+    road = Network(ROOT / "networks" / "exit.net.xml").road(("before", "after"))
+    rng = np.random.default_rng(0)
+    s, d = rng.uniform(-10.0, road.length + 50.0, 3000), rng.uniform(-30.0, 12.0, 3000)
+    one = [road.lane_of(*point) for point in zip(s.tolist(), d.tolist(), strict=True)]
+    assert one == road.lane_index(s, d).tolist()
+    assert len(set(one)) == road.lane_centre.shape[1]

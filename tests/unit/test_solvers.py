@@ -145,6 +145,15 @@ def test_what_solvers_read_is_what_is_known() -> None:
     assert instance.start[:4].tolist() == list(asked.ego)
 
 
+def test_more_cars_than_the_settings_count_are_left_out() -> None:
+    transcription = Transcription(SETTINGS, 3)
+    cars = np.array([(110.0 + 10.0 * i, 0.0, 0.0, 20.0, 5.0, 1.8, 0.0) for i in range(12)])
+    instance = transcription.write(replace(problem(7), cars=cars))
+    assert instance is not None
+    written = part(instance.stages, "cars").reshape(10, SETTINGS.cars, 6)
+    assert written[0, :, 0] == pytest.approx(cars[:8, 0] + 2.0)
+
+
 def test_the_change_of_the_first_control_is_bounded_if_one_was_driven() -> None:
     transcription, asked = Transcription(SETTINGS, 3), problem(7)
     ego = RoadState(100.0, 0.0, 0.0, 20.0)
