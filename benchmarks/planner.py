@@ -357,7 +357,7 @@ def floor(horizon: int) -> dict[str, float]:
     host.solve(problem)
     solver, found = host.solver, {}
     assert isinstance(solver, mpc_module.Ilqr)
-    for name, run in (("objective", solver._run_forward), ("derivatives", solver._run_exact)):
+    for name, run in (("objective", solver._forward[0]), ("derivatives", solver._exact[0])):
         times = []
         for _ in range(2000):
             begin = time.perf_counter()

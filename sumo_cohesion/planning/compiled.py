@@ -14,12 +14,14 @@ import platform
 import shutil
 import subprocess
 import tempfile
+from array import array
 from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import casadi as ca
+import numpy as np
 
 from sumo_cohesion.locks import alone
 from sumo_cohesion.state import FloatArray
@@ -107,16 +109,22 @@ def _compile(code: str, compiler: str, library: Path) -> None:
         new.replace(library)
 
 
+Numbers: TypeAlias = "FloatArray | array[float]"
+"""What a function can read and write in place."""
+
+
 class BoundCall:
     """A call without arguments that reads and writes arrays in place: nothing is converted."""
 
-    def __init__(self, function: Any, inputs: list[FloatArray], outputs: list[FloatArray]) -> None:
+    def __init__(
+        self, function: Any, inputs: Sequence[Numbers], outputs: Sequence[Numbers]
+    ) -> None:
         self._keep = (function, inputs, outputs)  # CasADi keeps only their addresses
         self._buffer, self._run = function.buffer()
-        for i, array in enumerate(inputs):
-            self._buffer.set_arg(i, array.reshape(-1).data)
-        for i, array in enumerate(outputs):
-            self._buffer.set_res(i, array.reshape(-1).data)
+        for i, numbers in enumerate(inputs):
+            self._buffer.set_arg(i, np.asarray(numbers).reshape(-1).data)
+        for i, numbers in enumerate(outputs):
+            self._buffer.set_res(i, np.asarray(numbers).reshape(-1).data)
 
     def __call__(self) -> None:
         """Read the inputs, write the outputs."""

@@ -16,12 +16,14 @@ and several times faster compiled (planning.compiled).
 from __future__ import annotations
 
 import time
+from array import array
+from math import isfinite
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
-from sumo_cohesion.planning.compiled import BoundCall, compiled
+from sumo_cohesion.planning.compiled import BoundCall, Numbers, compiled
 from sumo_cohesion.planning.problem import Instance, Solution
 from sumo_cohesion.planning.settings import PlannerSettings
 from sumo_cohesion.planning.stage import (
@@ -72,39 +74,46 @@ class Ilqr:
         self._allocate(*functions)
 
     def _allocate(self, exact: Any, gauss_newton: Any, forward: Any) -> None:
-        """Make the arrays that both functions read and write in place."""
+        """Make the arrays that the functions read and write in place.
+
+        There are two trajectories: a forward pass reads the present one and writes the other.
+        """
         t, f = self._settings.horizon, np.zeros
-        self._x, self._x_new = f((t + 1, N_STATES)), f((t + 1, N_STATES))
-        self._u, self._u_new = f((t, 2)), f((t, 2))
+        self._x, self._u = [f((t + 1, N_STATES)) for _ in range(2)], [f((t, 2)) for _ in range(2)]
+        self._terms = [f(len(TERMS)) for _ in range(2)]
+        self._now = 0
         self._p = f((t, self._parameters.size))
         self._low, self._high, self._most = f((t, 2)), f((t, 2)), f((t, 2))
         self._step, self._gain = f((t, 2)), f((t, N_STATES, 2))
-        self._mu, self._length, self._cost = f(1), f(1), f(1)
-        self._change, self._convexity, self._terms = f(1), f(1), f(len(TERMS))
-        bounds = [self._low, self._high, self._most]
-        # A C-ordered (T, n) array is a CasADi matrix of T columns.
-        given = [self._x, self._u, self._p, *bounds]
-        found = [self._step, self._gain, self._change, self._convexity]
-        self._run_exact = BoundCall(exact, [*given, self._mu], found)
-        self._run_gauss_newton = BoundCall(gauss_newton, [*given, self._mu], found)
-        self._run_forward = BoundCall(
-            forward,
-            [*given, self._step, self._gain, self._length],
-            [self._x_new, self._u_new, self._cost, self._terms],
+        # Python's arrays: their items are Python's numbers, several times faster than NumPy's.
+        self._mu, self._length, self._cost, self._change, self._convexity = (
+            array("d", [0.0]) for _ in range(5)
         )
+        policy: list[Numbers] = [self._step, self._gain]
+        found = [*policy, self._change, self._convexity]
+        self._exact: list[BoundCall] = []
+        self._gauss_newton: list[BoundCall] = []
+        self._forward: list[BoundCall] = []
+        for now, other in ((0, 1), (1, 0)):
+            # A C-ordered (T, n) array is a CasADi matrix of T columns.
+            given = [self._x[now], self._u[now], self._p, self._low, self._high, self._most]
+            new: list[Numbers] = [self._x[other], self._u[other], self._cost, self._terms[other]]
+            self._exact.append(BoundCall(exact, [*given, self._mu], found))
+            self._gauss_newton.append(BoundCall(gauss_newton, [*given, self._mu], found))
+            self._forward.append(BoundCall(forward, [*given, *policy, self._length], new))
 
     def solve(self, instance: Instance, guess: FloatArray) -> Solution:
         """Solve from guessed controls, (T, 2)."""
         start = time.perf_counter()
         self._load(instance, guess)
         cost = self._roll_out(0.0)
-        if not np.isfinite(cost):
+        if not isfinite(cost):
             return self._result("cost is not finite", 0, start, solved=False)
-        self._accept()
+        self._now = 1 - self._now
         exact, mu = True, _REGULARISATION[0]
         for iteration in range(1, self._settings.max_iterations + 1):
             self._mu[0] = mu
-            (self._run_exact if exact else self._run_gauss_newton)()
+            (self._exact if exact else self._gauss_newton)[self._now]()
             if exact and not self._convexity[0] > _LEAST_CURVATURE:
                 exact = False
                 continue
@@ -113,7 +122,7 @@ class Ilqr:
                 return self._result("solved", iteration, start, solved=True)
             new_cost = self._search(cost, promised)
             if new_cost is not None:
-                self._accept()
+                self._now = 1 - self._now
                 gained = cost - new_cost
                 small = gained < TOLERANCE * (1.0 + abs(cost))
                 if gained > _GOOD_SHARE * promised:
@@ -135,10 +144,13 @@ class Ilqr:
         )
 
     def _load(self, instance: Instance, guess: FloatArray) -> None:
-        self._p[:], self._x[0] = instance.stages, instance.start
+        x = self._x[self._now]
+        x.fill(0.0)
+        self._p[:], x[0] = instance.stages, instance.start
         self._low[:], self._high[:], self._most[:] = instance.low, instance.high, instance.change
-        np.divide(guess, CONTROL_SCALE, out=self._u)  # limited as it is rolled out
-        self._step[:], self._gain[:] = 0.0, 0.0
+        np.divide(guess, CONTROL_SCALE, out=self._u[self._now])  # limited as it is rolled out
+        self._step.fill(0.0)
+        self._gain.fill(0.0)
 
     def _search(self, cost: float, promised: float) -> float | None:
         """Shorten the step until it lowers the cost enough; None if no length does."""
@@ -152,12 +164,8 @@ class Ilqr:
 
     def _roll_out(self, length: float) -> float:
         self._length[0] = length
-        self._run_forward()
-        return float(self._cost[0])
-
-    def _accept(self) -> None:
-        self._x[:], self._u[:] = self._x_new, self._u_new
-        self._accepted = self._terms.copy()
+        self._forward[self._now]()
+        return self._cost[0]
 
     def _result(self, status: str, iterations: int, start: float, *, solved: bool) -> Solution:
         if not solved:
@@ -171,13 +179,13 @@ class Ilqr:
                 {},
             )
         return Solution(
-            states=self._x[:, :4].copy(),
-            controls=self._u * CONTROL_SCALE,
+            states=self._x[self._now][:, :4].copy(),
+            controls=self._u[self._now] * CONTROL_SCALE,
             solved=True,
             status=status,
             iterations=iterations,
             wall_time=time.perf_counter() - start,
-            reward=dict(zip(TERMS, self._accepted.tolist(), strict=True)),
+            reward=dict(zip(TERMS, self._terms[self._now].tolist(), strict=True)),
         )
 
 

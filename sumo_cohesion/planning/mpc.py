@@ -6,7 +6,6 @@ The problem is written down once (planning.stage); which solver solves it is a s
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import lru_cache, partial
 from typing import Protocol
 
@@ -120,8 +119,7 @@ class Mpc:
         """Try IPOPT, slower and sturdier."""
         ipopt = shared_solver("ipopt", self.settings, self.n_lanes)
         second = self._attempt(ipopt, instance, guess)
-        return replace(
-            second,
+        return second._replace(
             status=RESCUED if second.solved else f"{failed.status}; {second.status}",
             iterations=failed.iterations + second.iterations,
             wall_time=failed.wall_time + second.wall_time,

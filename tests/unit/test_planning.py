@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from math import cos, sin
 
 import numpy as np
@@ -255,7 +254,7 @@ def test_a_problem_that_is_not_a_number_is_refused(highway: Road) -> None:
     scene = observation((100.0, 0.0, 0.0, 25.0), [])
     problem = planner._problem(scene, (), NOWHERE, None)
     assert planner._mpc is not None
-    broken = replace(problem, ego=RoadState(np.nan, 0.0, 0.0, 25.0))
+    broken = problem._replace(ego=RoadState(np.nan, 0.0, 0.0, 25.0))
     solution = planner._mpc.solve(broken)
     assert not solution.solved
     assert solution.status == "input is not finite"

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from dataclasses import replace
 from itertools import product
 from pathlib import Path
 
@@ -123,7 +122,7 @@ def test_what_solvers_read_is_what_is_known() -> None:
     car = (130.0, 3.0, 0.1, 20.0, 12.0, 2.4, 0.004)
     road = straight_road(10)
     road.rows[:, 0], road.rows[3:, -2], road.rows[:, -1] = np.inf, 30.0, 0.001 * np.arange(11)
-    asked = replace(asked, cars=np.array([car]), road=road, transitions=4)
+    asked = asked._replace(cars=np.array([car]), road=road, transitions=4)
     instance = transcription.write(asked)
     assert instance is not None
     rows, time = instance.stages, 0.1 * np.arange(1, 11)
@@ -148,7 +147,7 @@ def test_what_solvers_read_is_what_is_known() -> None:
 def test_more_cars_than_the_settings_count_are_left_out() -> None:
     transcription = Transcription(SETTINGS, 3)
     cars = np.array([(110.0 + 10.0 * i, 0.0, 0.0, 20.0, 5.0, 1.8, 0.0) for i in range(12)])
-    instance = transcription.write(replace(problem(7), cars=cars))
+    instance = transcription.write(problem(7)._replace(cars=cars))
     assert instance is not None
     written = part(instance.stages, "cars").reshape(10, SETTINGS.cars, 6)
     assert written[0, :, 0] == pytest.approx(cars[:8, 0] + 2.0)
@@ -157,13 +156,13 @@ def test_more_cars_than_the_settings_count_are_left_out() -> None:
 def test_the_change_of_the_first_control_is_bounded_if_one_was_driven() -> None:
     transcription, asked = Transcription(SETTINGS, 3), problem(7)
     ego = RoadState(100.0, 0.0, 0.0, 20.0)
-    free = transcription.write(replace(asked, ego=ego, driven=None))
+    free = transcription.write(asked._replace(ego=ego, driven=None))
     assert free is not None
     assert (free.change[0] == UNLIMITED).all()
     assert (free.start[4:] == 0.0).all()
     most = 0.1 * SETTINGS.max_curvature_rate / 0.01, 0.1 * SETTINGS.max_jerk / 5.0
     assert free.change[1] == pytest.approx(most)
-    bound = transcription.write(replace(asked, ego=ego, driven=Control(0.002, -50.0)))
+    bound = transcription.write(asked._replace(ego=ego, driven=Control(0.002, -50.0)))
     assert bound is not None
     assert bound.change[0] == pytest.approx(most)
     # Braking harder than is allowed now would leave nothing to choose.
@@ -183,18 +182,18 @@ def test_what_cannot_be_a_solution_is_found_out() -> None:
         for column in range(4):
             wrong[:] = 0.0
             wrong[row, column] = 0.002
-            assert not transcription.is_solution(replace(good, states=states + wrong))
+            assert not transcription.is_solution(good._replace(states=states + wrong))
     for value in (np.nan, np.inf, 0.02):
         for row in (0, 9):
             broken = controls.copy()
             broken[row, 0] = value
-            assert not transcription.is_solution(replace(good, controls=broken))
+            assert not transcription.is_solution(good._replace(controls=broken))
     for value in (np.nan, np.inf, -np.inf):
         broken = states.copy()
         broken[7, 1] = value
-        assert not transcription.is_solution(replace(good, states=broken))
-    assert not transcription.is_solution(replace(good, states=states[:-1]))
-    assert not transcription.is_solution(replace(good, controls=controls[:-1]))
+        assert not transcription.is_solution(good._replace(states=broken))
+    assert not transcription.is_solution(good._replace(states=states[:-1]))
+    assert not transcription.is_solution(good._replace(controls=controls[:-1]))
 
 
 def test_the_box_problem_is_solved_exactly() -> None:
@@ -237,7 +236,7 @@ def test_bounds_hold_whatever_is_asked(
 ) -> None:
     instance = problem(seed, cohesion=cohesion)
     last = None if driven is None else Control(*driven)
-    instance = replace(instance, ego=RoadState(100.0, d, heading, speed), driven=last)
+    instance = instance._replace(ego=RoadState(100.0, d, heading, speed), driven=last)
     mpc = solvers["ilqr"]
     mpc.reset()
     solution = mpc.solve(instance)
@@ -281,7 +280,7 @@ def test_tight_rates_bind_and_hold(name: str) -> None:
     mpc, bound = Mpc(tight, 3), 0
     for seed in range(1, 21, 2):
         mpc.reset()
-        instance = replace(problem(seed), driven=Control(0.0, 0.0))
+        instance = problem(seed)._replace(driven=Control(0.0, 0.0))
         solution = mpc.solve(instance)
         assert solution.status == "solved"
         both = np.vstack((np.zeros(2), solution.controls))
@@ -298,8 +297,7 @@ def test_no_cohesion_buys_leaving_the_road(cohesion: float) -> None:
     mpc = Mpc(SETTINGS, 3)
     instance = problem(3, cohesion=cohesion)
     pull = 36.0 * cohesion
-    instance = replace(
-        instance,
+    instance = instance._replace(
         ego=RoadState(100.0, 4.0, 0.0, 25.0),
         cars=np.zeros((0, 7)),
         cohesion_weight=(pull, 0.0, pull, 0.0, pull),  # turn left, hard
@@ -316,8 +314,7 @@ def test_no_cohesion_buys_leaving_the_road(cohesion: float) -> None:
 
 
 def test_a_car_that_has_to_stop_stops(solvers: dict[str, Mpc]) -> None:
-    instance = replace(
-        problem(0, cohesion=0.0),
+    instance = problem(0, cohesion=0.0)._replace(
         ego=RoadState(100.0, 0.0, 0.0, 2.0),
         road=straight_road(10, limit=0.0),
         cars=np.array([[106.5, 0.0, 0.0, 0.0, 5.0, 1.8, 0.0]]),
