@@ -358,7 +358,7 @@ def floor(solver: Any) -> list[float]:
     Of the instance that our solver has solved last, timed as its solves are, less the clock's own
     time.
     """
-    passes = solver._forward[solver._now], solver._exact[solver._now]
+    passes = solver._forward[solver._present], solver._exact[solver._present]
     clock, *took = (float(np.median(timed(run)[0])) for run in (lambda: None, *passes))
     return [1e3 * (ms - clock) for ms in took]
 

@@ -132,8 +132,8 @@ def simulate(setup: Setup, planner: Planner, *, gui: bool = False) -> Rollout:
 def _older_objects_left_alone() -> Iterator[None]:
     """Let the garbage collector look through the run's own objects only.
 
-    All that is imported is a hundred times as much, and looking through it again and again takes
-    longer than the solver.
+    What is imported is several times as much, and looking through it can take as long as all of a
+    run's solves.
     """
     if gc.get_freeze_count():  # somebody else's
         yield

@@ -34,7 +34,7 @@ def violations(state: Any, inputs: StageInputs, ego_width: Any) -> Any:
 
 
 def _too_near(inputs: StageInputs) -> Any:
-    # Three square roots: an eighth one takes twice as long.
+    # Three square roots are faster than a power of 1/8.
     distance = ca.sqrt(ca.sqrt(ca.sqrt(inputs.along**8 + inputs.across**8 + 1e-12)))
     return (CORNERS - distance) * inputs.half_widths
 

@@ -76,16 +76,17 @@ class Ilqr:
     def _allocate(self, exact: Any, gauss_newton: Any, forward: Any) -> None:
         """Make the arrays that the functions read and write in place.
 
-        There are two trajectories: a forward pass reads the present one and writes the other.
+        There are two trajectories: a forward pass reads the present one and writes the other, which
+        `_accept` makes the present one.
         """
         t, f = self._settings.horizon, np.zeros
         self._x, self._u = [f((t + 1, N_STATES)) for _ in range(2)], [f((t, 2)) for _ in range(2)]
         self._terms = [f(len(TERMS)) for _ in range(2)]
-        self._now = 0
+        self._present = 0
         self._p = f((t, self._parameters.size))
         self._low, self._high, self._most = f((t, 2)), f((t, 2)), f((t, 2))
         self._step, self._gain = f((t, 2)), f((t, N_STATES, 2))
-        # Python's arrays: their items are Python's numbers, several times faster than NumPy's.
+        # Python's arrays: their items are Python's numbers, which are faster than NumPy's.
         self._mu, self._length, self._cost, self._change, self._convexity = (
             array("d", [0.0]) for _ in range(5)
         )
@@ -94,9 +95,10 @@ class Ilqr:
         self._exact: list[BoundCall] = []
         self._gauss_newton: list[BoundCall] = []
         self._forward: list[BoundCall] = []
-        for now, other in ((0, 1), (1, 0)):
+        for present, other in ((0, 1), (1, 0)):
             # A C-ordered (T, n) array is a CasADi matrix of T columns.
-            given = [self._x[now], self._u[now], self._p, self._low, self._high, self._most]
+            trajectory = [self._x[present], self._u[present]]
+            given = [*trajectory, self._p, self._low, self._high, self._most]
             new: list[Numbers] = [self._x[other], self._u[other], self._cost, self._terms[other]]
             self._exact.append(BoundCall(exact, [*given, self._mu], found))
             self._gauss_newton.append(BoundCall(gauss_newton, [*given, self._mu], found))
@@ -109,11 +111,11 @@ class Ilqr:
         cost = self._roll_out(0.0)
         if not isfinite(cost):
             return self._result("cost is not finite", 0, start, solved=False)
-        self._now = 1 - self._now
+        self._accept()
         exact, mu = True, _REGULARISATION[0]
         for iteration in range(1, self._settings.max_iterations + 1):
             self._mu[0] = mu
-            (self._exact if exact else self._gauss_newton)[self._now]()
+            (self._exact if exact else self._gauss_newton)[self._present]()
             if exact and not self._convexity[0] > _LEAST_CURVATURE:
                 exact = False
                 continue
@@ -122,7 +124,7 @@ class Ilqr:
                 return self._result("solved", iteration, start, solved=True)
             new_cost = self._search(cost, promised)
             if new_cost is not None:
-                self._now = 1 - self._now
+                self._accept()
                 gained = cost - new_cost
                 small = gained < TOLERANCE * (1.0 + abs(cost))
                 if gained > _GOOD_SHARE * promised:
@@ -144,11 +146,11 @@ class Ilqr:
         )
 
     def _load(self, instance: Instance, guess: FloatArray) -> None:
-        x = self._x[self._now]
+        x = self._x[self._present]
         x.fill(0.0)
         self._p[:], x[0] = instance.stages, instance.start
         self._low[:], self._high[:], self._most[:] = instance.low, instance.high, instance.change
-        np.divide(guess, CONTROL_SCALE, out=self._u[self._now])  # limited as it is rolled out
+        np.divide(guess, CONTROL_SCALE, out=self._u[self._present])  # limited as it is rolled out
         self._step.fill(0.0)
         self._gain.fill(0.0)
 
@@ -162,9 +164,13 @@ class Ilqr:
             length *= _SHORTEN
         return None
 
+    def _accept(self) -> None:
+        """Take what was rolled out last."""
+        self._present = 1 - self._present
+
     def _roll_out(self, length: float) -> float:
         self._length[0] = length
-        self._forward[self._now]()
+        self._forward[self._present]()
         return self._cost[0]
 
     def _result(self, status: str, iterations: int, start: float, *, solved: bool) -> Solution:
@@ -179,13 +185,13 @@ class Ilqr:
                 {},
             )
         return Solution(
-            states=self._x[self._now][:, :4].copy(),
-            controls=self._u[self._now] * CONTROL_SCALE,
+            states=self._x[self._present][:, :4].copy(),
+            controls=self._u[self._present] * CONTROL_SCALE,
             solved=True,
             status=status,
             iterations=iterations,
             wall_time=time.perf_counter() - start,
-            reward=dict(zip(TERMS, self._terms[self._now].tolist(), strict=True)),
+            reward=dict(zip(TERMS, self._terms[self._present].tolist(), strict=True)),
         )
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib
 import sys
+from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
 from time import perf_counter
@@ -31,7 +32,7 @@ from sumo_cohesion.social.groups import group_votes
 from sumo_cohesion.social.place import NOWHERE, Place, agree_on_place
 from sumo_cohesion.social.place import SCALE as PLACE_SCALE
 from sumo_cohesion.social.settings import CohesionSettings, as_printed
-from sumo_cohesion.state import Control, FloatArray, Observation, Plan
+from sumo_cohesion.state import AgreementRow, Control, FloatArray, Observation, Plan
 
 if TYPE_CHECKING:
     from sumo_cohesion.planning.mpc import Mpc
@@ -186,13 +187,14 @@ class CohesivePlanner:
         social_time: float,
     ) -> Plan:
         assert self._mpc is not None
-        ego, why = observation.ego, None
+        ego = observation.ego
+        why: Sequence[AgreementRow] = ()
         if groups:
             why = Explanation(ego, self._road.bend_at(ego.s), groups, place, self.cohesion.beta)
         if solution.solved:
             controls, states = _controls(solution.controls), solution.states
         elif (rest := self._mpc.rest) is not None:
-            controls, states = _controls(rest[1]), rest[0]
+            states, controls = rest[0], _controls(rest[1])
         else:
             braking = fallback(observation, self._road, self.settings, solution.status)
             controls, states = braking.controls, braking.states
@@ -206,7 +208,7 @@ class CohesivePlanner:
             wall_time=solution.wall_time,
             social_time=social_time,
             reward=solution.reward,
-            agreement=why or (),
+            agreement=why,
         )
 
 

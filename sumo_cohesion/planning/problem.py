@@ -1,6 +1,6 @@
 """One planning problem and its solution: what crosses the border between planner and solvers.
 
-Named tuples, which are made faster than frozen dataclasses: there are three in every plan.
+Named tuples, which are made faster than frozen dataclasses: every plan makes two.
 """
 
 from __future__ import annotations

@@ -63,19 +63,10 @@ def _vote_at_place(
     track: Track, passed: range, d: float, settings: CohesionSettings
 ) -> Vote | None:
     """Mean features of those transitions that are near d (m), too; None if none is."""
-    width, across = settings.position_width, track.middle_d[passed.start : passed.stop]
-    if not across:
+    across, width = track.middle_d, settings.position_width
+    here = [i for i in passed if abs(across[i] - d) <= width]
+    if not here:
         return None
-    least, most = min(across) - d, max(across) - d
-    if least > width or most < -width:
-        return None
-    if -width <= least and most <= width:
-        features, first = track.features[passed.start : passed.stop], passed.start
-    else:
-        here = [i for i in passed if abs(track.middle_d[i] - d) <= width]
-        if not here:
-            return None
-        features, first = [track.features[i] for i in here], here[0]
-    n = len(features)
-    means = [total / n for total in map(sum, zip(*features, strict=True))]
-    return Vote(tuple(means), track.habits[first])
+    n = len(here)
+    columns = zip(*[track.features[i] for i in here], strict=True)
+    return Vote(tuple([sum(column) / n for column in columns]), track.habits[here[0]])
