@@ -22,7 +22,6 @@ os.environ["OPENBLAS_NUM_THREADS"] = "1"
 
 import argparse
 import contextlib
-import copy
 import io
 import json
 import time
@@ -314,12 +313,13 @@ def compare(horizon: int, n: int) -> tuple[pd.DataFrame, dict[str, float]]:
     n_lanes = max(map(lanes_of, problems))
     problems = [problem for problem in problems if lanes_of(problem) == n_lanes]
     host, transcription = Mpc(settings, n_lanes), Transcription(settings, n_lanes)
-    instances = [copy.deepcopy(transcription.write(problem)) for problem in problems]
     bends = StageParameters(settings, n_lanes).columns("road_curvature")
     judge, rows, floors = Judge(settings, n_lanes), [], []
     built = methods(settings, n_lanes)
     warm: dict[str, np.ndarray] = {}
-    for i, (problem, instance) in enumerate(zip(problems, instances, strict=True)):
+    for i, problem in enumerate(problems):
+        instance = transcription.write(problem)
+        assert instance is not None, "a recorded problem is finite"
         hold = host.hold(problem)
         nothing = judge.reward(instance, hold / CONTROL_SCALE)
         order = list(built)[i % len(built) :] + list(built)[: i % len(built)]

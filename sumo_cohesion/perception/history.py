@@ -10,7 +10,7 @@ from __future__ import annotations
 from array import array
 from bisect import bisect_left, bisect_right
 from collections import deque
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable
 from itertools import compress
 from math import atan2
 from operator import not_
@@ -100,20 +100,14 @@ class Track:
             return self.features[-1]
         return None
 
-    def across(self, places: Sequence[float]) -> list[float]:
-        """Where across the road (d, m) the car was when it passed some places s (m).
-
-        Up to the first place of which that is not known.
-        """
+    def d_at(self, s: float) -> float | None:
+        """Where across the road (m) the car was when it passed s (m); None if that is not known."""
         middle_s, middle_d = self.middle_s, self.middle_d
-        n, found = len(middle_s), []
-        for s in places:
-            after = bisect_right(middle_s, s)
-            if not 0 < after < n:
-                break
-            s0, d0 = middle_s[after - 1], middle_d[after - 1]
-            found.append(d0 + (middle_d[after] - d0) * (s - s0) / (middle_s[after] - s0))
-        return found
+        after = bisect_right(middle_s, s)
+        if not 0 < after < len(middle_s):
+            return None
+        s0, d0 = middle_s[after - 1], middle_d[after - 1]
+        return d0 + (middle_d[after] - d0) * (s - s0) / (middle_s[after] - s0)
 
     def habit_at(self, s: float) -> Features:
         """Variance of the car's features in its own past when it passed s."""

@@ -122,10 +122,18 @@ class BoundCall:
         self._keep = (function, inputs, outputs)  # CasADi keeps only their addresses
         self._buffer, self._run = function.buffer()
         for i, numbers in enumerate(inputs):
-            self._buffer.set_arg(i, np.asarray(numbers).reshape(-1).data)
+            self._buffer.set_arg(i, _flat(numbers))
         for i, numbers in enumerate(outputs):
-            self._buffer.set_res(i, np.asarray(numbers).reshape(-1).data)
+            self._buffer.set_res(i, _flat(numbers))
 
     def __call__(self) -> None:
         """Read the inputs, write the outputs."""
         self._run()
+
+
+def _flat(numbers: Numbers) -> memoryview:
+    """Return the numbers' own memory; ValueError if they do not lie side by side in it."""
+    array = np.asarray(numbers)
+    if not array.flags.c_contiguous:
+        raise ValueError("a function cannot read in place what does not lie side by side")
+    return array.reshape(-1).data

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import time
 from array import array
+from collections.abc import Callable
 from math import isfinite
 from typing import Any
 
@@ -69,11 +70,13 @@ class Ilqr:
                 _backward_pass(stage, settings, exact=True),
                 _backward_pass(stage, settings, exact=False),
                 _forward_pass(stage, settings),
+                _rollout(stage, settings),
             ]
         )
-        self._allocate(*functions)
+        self._functions = functions
+        self._allocate()
 
-    def _allocate(self, exact: Any, gauss_newton: Any, forward: Any) -> None:
+    def _allocate(self) -> None:
         """Make the arrays that the functions read and write in place.
 
         There are two trajectories: a forward pass reads the present one and writes the other, which
@@ -83,32 +86,43 @@ class Ilqr:
         self._x, self._u = [f((t + 1, N_STATES)) for _ in range(2)], [f((t, 2)) for _ in range(2)]
         self._terms = [f(len(TERMS)) for _ in range(2)]
         self._present = 0
-        self._p = f((t, self._parameters.size))
-        self._low, self._high, self._most = f((t, 2)), f((t, 2)), f((t, 2))
-        self._step, self._gain = f((t, 2)), f((t, N_STATES, 2))
+        self._guess, self._step, self._gain = f((t, 2)), f((t, 2)), f((t, N_STATES, 2))
         # Python's arrays: their items are Python's numbers, which are faster than NumPy's.
         self._mu, self._length, self._cost, self._change, self._convexity = (
             array("d", [0.0]) for _ in range(5)
         )
+        self._bound: Instance | None = None
+
+    def _bind(self, instance: Instance) -> None:
+        """Let the functions read an instance where it is: the transcription's is always the same.
+
+        A C-ordered (T, n) array is a CasADi matrix of T columns.
+        """
+        exact, gauss_newton, forward, rollout = self._functions
+        start, *given = instance
         policy: list[Numbers] = [self._step, self._gain]
         found = [*policy, self._change, self._convexity]
         self._exact: list[BoundCall] = []
         self._gauss_newton: list[BoundCall] = []
         self._forward: list[BoundCall] = []
+        self._rollout: list[BoundCall] = []
         for present, other in ((0, 1), (1, 0)):
-            # A C-ordered (T, n) array is a CasADi matrix of T columns.
-            trajectory = [self._x[present], self._u[present]]
-            given = [*trajectory, self._p, self._low, self._high, self._most]
+            read = [self._x[present], self._u[present], *given]
             new: list[Numbers] = [self._x[other], self._u[other], self._cost, self._terms[other]]
-            self._exact.append(BoundCall(exact, [*given, self._mu], found))
-            self._gauss_newton.append(BoundCall(gauss_newton, [*given, self._mu], found))
-            self._forward.append(BoundCall(forward, [*given, *policy, self._length], new))
+            self._exact.append(BoundCall(exact, [*read, self._mu], found))
+            self._gauss_newton.append(BoundCall(gauss_newton, [*read, self._mu], found))
+            self._forward.append(BoundCall(forward, [*read, *policy, self._length], new))
+            self._rollout.append(BoundCall(rollout, [start, self._guess, *given], new))
+        self._bound = instance
 
     def solve(self, instance: Instance, guess: FloatArray) -> Solution:
         """Solve from guessed controls, (T, 2)."""
         start = time.perf_counter()
-        self._load(instance, guess)
-        cost = self._roll_out(0.0)
+        if instance is not self._bound:
+            self._bind(instance)
+        np.divide(guess, CONTROL_SCALE, out=self._guess)
+        self._rollout[self._present]()
+        cost = self._cost[0]
         if not isfinite(cost):
             return self._result("cost is not finite", 0, start, solved=False)
         self._accept()
@@ -145,33 +159,20 @@ class Ilqr:
             "too many iterations", self._settings.max_iterations, start, solved=False
         )
 
-    def _load(self, instance: Instance, guess: FloatArray) -> None:
-        x = self._x[self._present]
-        x.fill(0.0)
-        self._p[:], x[0] = instance.stages, instance.start
-        self._low[:], self._high[:], self._most[:] = instance.low, instance.high, instance.change
-        np.divide(guess, CONTROL_SCALE, out=self._u[self._present])  # limited as it is rolled out
-        self._step.fill(0.0)
-        self._gain.fill(0.0)
-
     def _search(self, cost: float, promised: float) -> float | None:
         """Shorten the step until it lowers the cost enough; None if no length does."""
         length = 1.0
         while length > _SHORTEST_STEP:
-            new_cost = self._roll_out(length)
-            if new_cost < cost - _SUFFICIENT * length * promised:
-                return new_cost
+            self._length[0] = length
+            self._forward[self._present]()
+            if self._cost[0] < cost - _SUFFICIENT * length * promised:
+                return self._cost[0]
             length *= _SHORTEN
         return None
 
     def _accept(self) -> None:
         """Take what was rolled out last."""
         self._present = 1 - self._present
-
-    def _roll_out(self, length: float) -> float:
-        self._length[0] = length
-        self._forward[self._present]()
-        return self._cost[0]
 
     def _result(self, status: str, iterations: int, start: float, *, solved: bool) -> Solution:
         if not solved:
@@ -352,22 +353,45 @@ def _least_eigenvalue(h: Any) -> Any:
     return mean - ca.sqrt(half**2 + h[0, 1] ** 2)
 
 
+def _rollout(stage: Stage, settings: PlannerSettings) -> Any:
+    """(start, u, p, low, high, most) -> (x, u within limits, cost, terms)."""
+    start = ca.MX.sym("start", N_STATES)
+    _, u, p, *bounds = _trajectory(stage, settings.horizon)
+    driven = _driven(stage, settings, start, lambda i, _: u[:, i], [p, *bounds])
+    return ca.Function("rollout", [start, u, p, *bounds], driven)
+
+
 def _forward_pass(stage: Stage, settings: PlannerSettings) -> Any:
     """(x, u, p, low, high, most, steps, gains, length) -> (new x, new u, cost, terms)."""
-    one = limited_stage(stage, settings)
     t, n = settings.horizon, N_STATES
     x, u, p, *bounds = _trajectory(stage, t)
     steps, gains, length = ca.MX.sym("steps", 2, t), ca.MX.sym("gains", 2, n * t), ca.MX.sym("a")
-    states, controls, total = [x[:, 0]], [], ca.MX.zeros(len(TERMS))
-    for i in range(t):
-        feedback = gains[:, n * i : n * i + n] @ (states[-1] - x[:, i])
-        wanted = u[:, i] + length * steps[:, i] + feedback
-        state, control, terms = one(states[-1], wanted, p[:, i], *[b[:, i] for b in bounds])
+
+    def policy(i: int, state: Any) -> Any:
+        feedback = gains[:, n * i : n * i + n] @ (state - x[:, i])
+        return u[:, i] + length * steps[:, i] + feedback
+
+    driven = _driven(stage, settings, x[:, 0], policy, [p, *bounds])
+    return ca.Function("forward", [x, u, p, *bounds, steps, gains, length], driven)
+
+
+def _driven(
+    stage: Stage,
+    settings: PlannerSettings,
+    start: Any,
+    policy: Callable[[int, Any], Any],
+    given: list[Any],
+) -> list[Any]:
+    """Expressions of states, controls, cost and terms, from a start and (stage, state) -> control.
+
+    ``given`` are parameters and bounds, a column per stage.
+    """
+    one = limited_stage(stage, settings)
+    states, controls, total = [start], [], ca.MX.zeros(len(TERMS))
+    for i in range(settings.horizon):
+        wanted = policy(i, states[-1])
+        state, control, terms = one(states[-1], wanted, *[column[:, i] for column in given])
         states.append(state)
         controls.append(control)
         total += terms
-    return ca.Function(
-        "forward",
-        [x, u, p, *bounds, steps, gains, length],
-        [ca.horzcat(*states), ca.horzcat(*controls), -ca.sum1(total), total],
-    )
+    return [ca.horzcat(*states), ca.horzcat(*controls), -ca.sum1(total), total]

@@ -21,6 +21,8 @@ from sumo_cohesion.state import Control, Observation, Plan
 
 HARDEST_BRAKING = 8.0
 """m/s² that a car ahead may brake with."""
+ONCOMING_BRAKING = 4.0
+"""m/s² with which a car that comes the other way is trusted to brake, one step from now."""
 SIDE_MARGIN = 0.3
 """Metres between the sides of two cars below which the ego does not move closer."""
 
@@ -30,11 +32,12 @@ def checked(plan: Plan, observation: Observation, road: Road, settings: PlannerS
 
     - *Too close behind a car ahead*: if it braked with HARDEST_BRAKING, the ego, braking with its
       own most after one step, would hit it. The ego brakes with its most now.
+    - *Too close before a car that comes the other way*, likewise: it is trusted to brake with
+      ONCOMING_BRAKING.
     - *Too close beside a car*: the plan moves towards a car whose side is nearer than SIDE_MARGIN.
       The ego goes straight on instead, or on away from the car if that is what it planned.
 
-    Returns the same plan, or one of a single control that says which cars were too close. Cars that
-    come the other way are taken as standing.
+    Returns the same plan, or one of a single control that says which cars were too close.
     """
     if not plan.controls:
         return plan
@@ -58,20 +61,22 @@ def checked(plan: Plan, observation: Observation, road: Road, settings: PlannerS
         turned = abs(heading) * (size[0] / 2 + DT * abs(speed))
         if abs(d - after[1]) - turned - size[1] / 2 > clear:
             continue
+        along = speed * cos(heading)
         # Far away however it is turned, and wherever it is a step from now.
-        if abs(s - ego.s) > reach + pace + 2.0 * DT * speed + (size[0] + size[1]) / 2:
+        own_way = 2.0 * DT * speed + (_oncoming_way(-along) if along < 0.0 else 0.0)
+        if abs(s - ego.s) > reach + pace + own_way + (size[0] + size[1]) / 2:
             continue
         other = _extent(heading, size)
         aside = abs(d + DT * speed * sin(heading) - after[1]) - own[1] - other[1]
         if aside >= SIDE_MARGIN:
             continue
         stretch = 1.0 - float(observation.curvature[i]) * d
-        along = speed * cos(heading)
         ahead = s + DT * along / stretch - after[0] - own[0] - other[0]
         if s > ego.s and aside < 0.0 and ahead < safe_distance(after[3], along, settings):
             if acceleration > hardest + 1e-9:
                 acceleration = hardest
-                reasons.append(f"too close behind {observation.ids[i]}")
+                side = "behind" if along >= 0.0 else "before"
+                reasons.append(f"too close {side} {observation.ids[i]}")
             continue
         if abs(s - ego.s) < own[0] + other[0]:
             straight = min(curvature, level) if d > ego.d else max(curvature, level)
@@ -98,12 +103,20 @@ def _extent(heading: float, size: Sequence[float]) -> tuple[float, float]:
 
 
 def safe_distance(speed: float, speed_ahead: float, settings: PlannerSettings) -> float:
-    """Metres that the ego needs behind a car, bumper to bumper.
+    """Metres that the ego needs to a car ahead, bumper to bumper.
 
-    It may accelerate for one more step before it brakes. That it brakes no harder than the car
-    ahead can is assumed: then the gap is smallest when both stand.
+    The speeds (m/s) are along the road; the other's is negative if it comes the other way. The ego
+    may accelerate for one more step before it brakes. That it brakes no harder than the car ahead
+    can is assumed: then the gap is smallest when both stand.
     """
     faster = speed + DT * settings.max_acceleration
     braking = min(settings.max_braking, HARDEST_BRAKING)
     way = DT * (speed + faster) / 2 + faster**2 / (2 * braking)
-    return max(way - max(speed_ahead, 0.0) ** 2 / (2 * HARDEST_BRAKING), 0.0)
+    if speed_ahead < 0.0:
+        return way + _oncoming_way(-speed_ahead)
+    return max(way - speed_ahead**2 / (2 * HARDEST_BRAKING), 0.0)
+
+
+def _oncoming_way(speed: float) -> float:
+    """Metres that a car goes until it stands, if it keeps its speed (m/s) for one more step."""
+    return DT * speed + speed**2 / (2 * ONCOMING_BRAKING)

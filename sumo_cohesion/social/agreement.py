@@ -76,10 +76,11 @@ def estimate(values: Sequence[float], habits: Sequence[float], floor: float) -> 
     total = total_squared = weighted = squares = 0.0
     for x, habit in zip(values, habits, strict=True):
         q = 1.0 / (floor + habit)
+        qx = q * x
         total += q
         total_squared += q * q
-        weighted += q * x
-        squares += q * x * x
+        weighted += qx
+        squares += qx * x
     n, mean = len(values), weighted / total
     spread = max(squares / total - mean * mean, 0.0)
     unbiased = spread / (1.0 - total_squared / (total * total))

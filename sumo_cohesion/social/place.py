@@ -58,16 +58,14 @@ def agree_on_place(
     if len(companions) < settings.min_cars:
         return NOWHERE
     places = [ego.s + time * ego.speed for time in times]
-    found: list[tuple[list[float], list[float]]] = [([], []) for _ in places]
-    for track, habit in companions:
-        for (across, habits), d in zip(found, track.across(places), strict=False):
-            across.append(d / SCALE)
-            habits.append(habit)
     rows, surprise = [], 0.0
-    for s, (across, habits) in zip(places, found, strict=True):
-        if len(across) < settings.min_cars:
+    for s in places:
+        found = [(track.d_at(s), habit) for track, habit in companions]
+        known = [(d / SCALE, habit) for d, habit in found if d is not None]
+        if len(known) < settings.min_cars:
             rows.append((ego.d, 0.0, 0.0))
             continue
+        across, habits = zip(*known, strict=True)
         mean, variance = estimate(across, habits, settings.variance_floor)
         mean *= SCALE
         weight = settings.place_weight / (variance + settings.variance_floor)
@@ -98,7 +96,7 @@ def _companions(
     companions = []
     for track in tracks:
         s = max(farthest, track.middle_s[0])
-        d = track.across([s])
-        if d and abs(d[0] - path.at(s)) <= width:
+        d = track.d_at(s)
+        if d is not None and abs(d - path.at(s)) <= width:
             companions.append((track, track.habit_at(s)[_LATERAL]))
     return companions

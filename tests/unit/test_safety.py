@@ -7,7 +7,7 @@ import pytest
 
 from sumo_cohesion.planning.dynamics import step
 from sumo_cohesion.planning.planners import CohesivePlanner
-from sumo_cohesion.planning.safety import checked, safe_distance
+from sumo_cohesion.planning.safety import ONCOMING_BRAKING, checked, safe_distance
 from sumo_cohesion.planning.settings import PlannerSettings
 from sumo_cohesion.road import Road
 from sumo_cohesion.social.memory import new_history
@@ -71,6 +71,28 @@ def test_the_safe_distance_is_enough_when_the_car_ahead_brakes_its_hardest() -> 
             g += 0.05 * (f + f_next) - 0.05 * (v + v_next)
             v, f, least = v_next, f_next, min(least, g)
         assert least >= -0.05 * SETTINGS.max_braking  # within one step's rounding
+
+
+def test_before_an_oncoming_car_both_can_still_stop(highway: Road) -> None:
+    ego, other = (100.0, 0.0, 0.0, 20.0), (300.0, 0.0, np.pi, 15.0)
+    began, braking = 0.0, 0
+    while ego[3] > 0.0 or other[3] > 0.0:
+        observation = scene(ego, other)
+        plan = checked(planned(observation, 0.0, 0.0), observation, highway, SETTINGS)
+        if plan.intervened and not began:
+            assert "too close before car_0" in plan.status
+            began = other[0] - ego[0]
+        ego = tuple(max(float(v), 0.0) for v in step(ego, plan.controls[0], 0.1, 0.1))  # type: ignore[assignment]
+        # The other sees the ego as late as one step after the ego has seen it.
+        speed, braking = other[3], braking + bool(began)
+        slower = max(speed - 0.1 * ONCOMING_BRAKING, 0.0) if braking > 1 else speed
+        other = (other[0] - 0.05 * (speed + slower), 0.0, np.pi, slower)
+    gap = other[0] - ego[0] - 5.0
+    # No sooner than needed: what is left is what the ego would have accelerated, and rounding.
+    assert 0.0 <= gap < 5.0
+    # In its own lane it is nobody's business.
+    beside = scene((100.0, 0.0, 0.0, 20.0), (130.0, 3.5, np.pi, 20.0))
+    assert not checked(planned(beside, 0.0, 0.0), beside, highway, SETTINGS).intervened
 
 
 def test_beside_a_car_the_ego_does_not_move_closer(highway: Road) -> None:
