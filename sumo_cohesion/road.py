@@ -21,6 +21,10 @@ SPACING = 1.0
 """Metres between vertices of the reference line."""
 
 
+MISS = 1.0
+"""Metres beside the reference line up to which a path still keeps to the road (too_sharp)."""
+
+
 class RoadAhead(NamedTuple):
     """The road at n places, one row each.
 
@@ -189,6 +193,28 @@ class Road:
         for array in ahead:
             array.setflags(write=False)
         return ahead
+
+    def too_sharp(self, curvature: float, first: float, last: float) -> float | None:
+        """Where (s, m), between two places, no path of at most this curvature (1/m) keeps to it.
+
+        That is where one that turns in time would be more than MISS beside the reference line: a
+        quarter of how far one would be that turns with the line, and goes on until it has turned
+        as far. None if it can be followed everywhere.
+        """
+        i, j = (min(max(round((s - self.s0) / SPACING), 0), self.x.size - 1) for s in (first, last))
+        bends = self._bends[i : j + 1]
+        for side in (1.0, -1.0):
+            behind = aside = 0.0  # heading (rad) and metres that such a path lacks
+            begun = 0
+            for k, bend in enumerate(bends):
+                behind += (side * bend - curvature) * SPACING
+                if behind <= 0.0:
+                    behind, aside, begun = 0.0, 0.0, k + 1
+                aside += behind * SPACING
+                if aside > 4.0 * MISS:
+                    sharpest = max(range(begun, k + 1), key=lambda m: side * bends[m])
+                    return self.s0 + (i + sharpest) * SPACING
+        return None
 
     def project(self, x: float, y: float) -> tuple[float, float, float, float]:
         """Road coordinates of one Cartesian point.

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import os
+import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -32,3 +35,26 @@ def highway() -> Road:
 def curve() -> Road:
     network = Network(NETWORKS / "curve.net.xml")
     return network.road(network.route("straight", "bend_2"))
+
+
+@pytest.fixture(scope="session")
+def city(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Streets: a network of 8 x 8 crossings with two lanes each way, some with traffic lights."""
+    beside = Path(sys.executable).parent
+    program = shutil.which("netgenerate", path=f"{beside}{os.pathsep}{os.environ['PATH']}")
+    if program is None:
+        pytest.skip("netgenerate, which ships with eclipse-sumo, is not there")
+    path = tmp_path_factory.mktemp("city") / "city.net.xml"
+    grid = [
+        "--grid",
+        "--grid.number",
+        "8",
+        "--grid.length",
+        "150",
+        "-L",
+        "2",
+        "--tls.guess",
+        "true",
+    ]
+    subprocess.run([program, *grid, "-o", str(path)], check=True, capture_output=True)
+    return path

@@ -18,7 +18,7 @@ import numpy as np
 from sumo_cohesion.experiments.drive import END_OF_ROUTE, ask, drive
 from sumo_cohesion.perception.history import History
 from sumo_cohesion.perception.observation import Overview
-from sumo_cohesion.planning.planners import Planner, make_planner
+from sumo_cohesion.planning.planners import Planner, check_road, make_planner
 from sumo_cohesion.road import Road
 from sumo_cohesion.social.memory import SharedFeatures, new_history
 from sumo_cohesion.state import CartesianState, FloatArray, Scene
@@ -185,6 +185,8 @@ class Fleet:
         planner = make_planner(setup.planner_name, setup.settings, setup.cohesion)
         try:
             road = setup.road_along(register.route(name))
+            s, *_ = road.project(state[0], state[1])
+            check_road(setup.planner_name, setup.settings, road, s, setup.scenario.duration)
             planner.reset(road)
         except MemoryError:
             raise

@@ -10,7 +10,7 @@ from typing import Any
 
 from sumo_cohesion.errors import UserError
 from sumo_cohesion.experiments.scenario import Scenario, load_scenario, settings_from
-from sumo_cohesion.planning.planners import check_planner, cohesion_of
+from sumo_cohesion.planning.planners import check_planner, check_road, cohesion_of
 from sumo_cohesion.planning.settings import PlannerSettings
 from sumo_cohesion.road import Road
 from sumo_cohesion.social.settings import CohesionSettings
@@ -148,6 +148,7 @@ def prepare(
     check_human_type(loaded.human_type)
     route = check_demand(network, inputs.routes, loaded.ego, named)
     road = _road(inputs.network, *_version(inputs.network), tuple(route))
+    check_road(planner, inputs.settings, road, loaded.ego.position, loaded.duration)
     return Setup(**vars(inputs), seed=seed, route=tuple(route), road=road)
 
 

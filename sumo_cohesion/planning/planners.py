@@ -261,6 +261,27 @@ def make_planner(name: str, settings: PlannerSettings, cohesion: CohesionSetting
     return _load_planner(name)
 
 
+def check_road(
+    name: str, settings: PlannerSettings, road: Road, first: float, seconds: float
+) -> None:
+    """Raise UserError if a built-in planner could not keep to the road from a place on.
+
+    ``first`` is where (s, m) it starts, ``seconds`` how long it may drive at the speed limit.
+    """
+    if name == "sumo" or name not in BUILT_IN:
+        return
+    last = min(first + seconds * float(road.speed_limit.max()), road.length)
+    s = road.too_sharp(settings.max_curvature, first, last)
+    if s is not None:
+        sharpest = settings.max_curvature
+        raise UserError(
+            f"{s:.0f} m from its start the route turns with a radius of "
+            f"{1.0 / abs(road.bend_at(s)):.0f} m, and planner.max_curvature = {sharpest:g} allows "
+            f"{1.0 / sharpest:.0f} m; for streets set planner.max_curvature = 0.2 and "
+            "planner.max_curvature_rate = 1, or choose another route"
+        )
+
+
 @lru_cache(maxsize=32)
 def check_planner(name: str) -> None:
     """Raise UserError unless there is such a planner; a user's own is made once to see."""

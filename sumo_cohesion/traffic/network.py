@@ -190,8 +190,10 @@ class Network:
                         strips.append((to.getIndex(), via))
                     elif connection.getDirection() != connection.LINKDIR_TURN:
                         exits.append([*via, to])
-        strips += [(n_route + k, lanes) for k, lanes in enumerate(exits)]
-        columns = n_route + len(exits)
+        columns = n_route
+        for k, lanes in zip(_pack([_extent(road, lanes) for lanes in exits]), exits, strict=True):
+            strips.append((n_route + k, lanes))
+            columns = max(columns, n_route + k + 1)
         centre = np.full((road.x.size, columns), np.nan)
         width = np.full_like(centre, np.nan)
         limit = np.full(road.x.size, np.nan)
@@ -284,6 +286,34 @@ def _bare_road(line: FloatArray) -> Road:
         speed_limit=np.full(len(line), np.nan),
         n_route_lanes=1,
     )
+
+
+def _extent(road: Road, lanes: list[Any]) -> tuple[int, int]:
+    """First and last vertex of the reference line beside some lanes."""
+    beside = np.concatenate([_strip(road, _shape(lane))[0] for lane in lanes])
+    return (int(beside.min()), int(beside.max())) if beside.size else (0, 0)
+
+
+def _pack(extents: list[tuple[int, int]]) -> list[int]:
+    """Give each of some extents (first, last) a column, the first in which none is beside it.
+
+    >>> _pack([(0, 9), (5, 20), (11, 30), (12, 13)])
+    [0, 1, 0, 2]
+    """
+    columns: list[list[tuple[int, int]]] = []
+    chosen = []
+    for first, last in extents:
+        free = (
+            k
+            for k, taken in enumerate(columns)
+            if all(last + 1 < a or b + 1 < first for a, b in taken)
+        )
+        k = next(free, len(columns))
+        if k == len(columns):
+            columns.append([])
+        columns[k].append((first, last))
+        chosen.append(k)
+    return chosen
 
 
 def _strip(road: Road, shape: FloatArray) -> tuple[IntArray, FloatArray]:

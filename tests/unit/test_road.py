@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -104,8 +105,6 @@ def test_an_exit_is_drivable_until_it_has_parted(curve: Road) -> None:
 
 def test_a_real_motorway_maps_without_holes() -> None:
     sumo = pytest.importorskip("sumo", reason="ships with eclipse-sumo")
-    from pathlib import Path
-
     path = Path(sumo.__file__).parent / "tools" / "game" / "highway" / "highway.net.xml"
     if not path.is_file():
         pytest.skip("this eclipse-sumo does not ship the motorway")
@@ -114,6 +113,44 @@ def test_a_real_motorway_maps_without_holes() -> None:
     inside = slice(int(-road.s0), int(road.length - road.s0))
     assert not np.isnan(np.nanmin(road.lane_centre[inside], axis=1)).any()
     assert np.isfinite(road.speed_limit).all()
+
+
+def test_a_way_through_a_city_has_few_columns_of_lanes(
+    city: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Exits of one crossing after the other share columns: what a road costs grows with them."""
+    network = Network(city)
+    route = network.route("A0A1", "G7H7")
+    road = network.road(route)
+    monkeypatch.setattr("sumo_cohesion.traffic.network._pack", lambda extents: range(len(extents)))
+    apart = network.road(route)
+    assert len(route) > 12
+    assert apart.lane_centre.shape[1] > 30
+    assert road.lane_centre.shape[1] <= 8
+    assert (road.length, road.n_route_lanes) == (apart.length, apart.n_route_lanes)
+    k = road.n_route_lanes
+    assert np.array_equal(road.lane_centre[:, :k], apart.lane_centre[:, :k], equal_nan=True)
+    # Every exit is still there, beside the same places.
+    few, many = (np.sort(r.lane_centre[:, k:], axis=1) for r in (road, apart))  # NaN come last
+    assert np.array_equal(few, many[:, : few.shape[1]], equal_nan=True)
+    assert np.isnan(many[:, few.shape[1] :]).all()
+
+
+def test_where_a_road_turns_too_sharply(curve: Road, city: Path) -> None:
+    # The curve's radius is 505 m, from 100 m on.
+    assert curve.too_sharp(1 / 490, 0.0, curve.length) is None
+    s = curve.too_sharp(1 / 700, 0.0, curve.length)
+    assert s is not None
+    assert 100.0 < s < 300.0
+    assert curve.too_sharp(1 / 700, 0.0, 100.0) is None
+    streets = Network(city)
+    turn = streets.road(streets.route("A0A1", "A1B1"))
+    where = turn.too_sharp(0.01, 0.0, turn.length)
+    assert where is not None
+    assert 130.0 < where < 160.0  # the crossing
+    assert turn.too_sharp(0.2, 0.0, turn.length) is None
+    straight = streets.road(streets.route("A0A1", "A2A3"))
+    assert straight.too_sharp(0.001, 0.0, straight.length) is None
 
 
 def test_routes_that_do_not_exist_say_so() -> None:

@@ -1,0 +1,69 @@
+"""Streets: crossings, sharp turns, cross traffic."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sumo_cohesion import UserError, run
+
+SCENARIO = """
+name = "city"
+summary = "Around two corners of a city."
+network = "city.net.xml"
+routes = ["city.rou.xml"]
+duration = 50.0
+[ego]
+origin = "A0A1"
+destination = "{destination}"
+lane = {lane}
+position = 20.0
+speed = 5.0
+[success]
+collision = false
+"""
+DEMAND = """
+<routes>
+  <vType id="human" laneChangeModel="SL2015" speedDev="0.05"/>
+  <route id="along" edges="A0A1 A1B1 B1B2 B2B3"/>
+  <vehicle id="lead_0" type="human" route="along" depart="0" departPos="60" departLane="0"/>
+  <vehicle id="lead_1" type="human" route="along" depart="0" departPos="80" departLane="0"/>
+</routes>
+"""
+STREETS = {"planner.max_curvature": 0.2, "planner.max_curvature_rate": 1.0}
+
+
+def scenario(folder: Path, city: Path, destination: str, lane: int) -> Path:
+    (folder / "city.net.xml").write_bytes(city.read_bytes())
+    (folder / "city.rou.xml").write_text(DEMAND)
+    path = folder / "city.toml"
+    path.write_text(SCENARIO.format(destination=destination, lane=lane))
+    return path
+
+
+@pytest.mark.parametrize("planner", ["nominal", "cohesive"])
+def test_the_ego_turns_at_a_crossing(tmp_path: Path, city: Path, planner: str) -> None:
+    path = scenario(tmp_path, city, "A1B1", 0)
+    rollout = run(path, planner, overrides=STREETS)
+    metrics = rollout.metrics.iloc[0]
+    assert metrics["outcome"] == "route_end"
+    assert not metrics["exited"]
+    assert metrics["plan_failures"] == 0
+    ego = rollout.trajectory.query("vehicle == 'ego'").merge(rollout.plan, on="time")
+    # Within a crossing the road is no wider than the lanes across it, and parts with them.
+    beyond = np.maximum(ego["d"] + 0.9 - ego["road_left"], ego["road_right"] - ego["d"] + 0.9)
+    assert beyond.max() < 0.3
+    # It slows down for the corner by itself: 8 m/s² sideways at a radius of some 10 m.
+    corner = ego[(ego["s"] > 135.0) & (ego["s"] < 150.0)]
+    assert corner["speed"].min() < 10.0 < ego["speed"].max()
+
+
+def test_a_turn_that_is_too_sharp_for_the_planner_says_so(tmp_path: Path, city: Path) -> None:
+    path = scenario(tmp_path, city, "A1B1", 0)
+    with pytest.raises(UserError, match=r"radius of \d+ m, and planner.max_curvature = 0.01"):
+        run(path, "nominal")
+    # What is too far away to be reached does not matter, nor does it to SUMO's driver.
+    assert len(run(path, "nominal", overrides={"duration": 1.0}).plan) == 10
+    assert len(run(path, "sumo", overrides={"duration": 15.0}).plan) == 150
