@@ -23,7 +23,11 @@ from sumo_cohesion.errors import SimulationError, UserError
 if TYPE_CHECKING:
     import pandas as pd
 
-PLANNER_HELP = "nominal, cohesive, paper, sumo, or your own as module:Class."
+PLANNER_HELP = "nominal, cohesive, paper, sumo, or your own as module:Class(gain=2.5)."
+_SIDE_BY_SIDE = 4
+"""Planners, or points of a grid, that a summary shows beside each other."""
+_IN_SHORT = ("success", "collision", "off_road", "mean_speed", "plan_failures")
+"""What it shows of more than these."""
 _QUIET = 60.0
 """Seconds between two lines of progress where there is no terminal."""
 SET_HELP = "Change a setting, e.g. cohesion.beta=0.05, planner.horizon=10, ego.speed=20."
@@ -97,10 +101,11 @@ def compare(
     """Run several planners on the same seeds of SCENARIO and compare them."""
     from sumo_cohesion.experiments.comparison import compare as compare_planners
     from sumo_cohesion.experiments.scenario import parse_seeds
+    from sumo_cohesion.planning.planners import split_planners
     from sumo_cohesion.report.paths import draw_comparison
 
     folder = out if out is not None else Path("results") / Path(scenario).stem
-    names, numbers = [p.strip() for p in planners.split(",") if p.strip()], parse_seeds(seeds)
+    names, numbers = split_planners(planners), parse_seeds(seeds)
     with _clean_stdout(), _progress(f"{scenario}") as progress:
         result = compare_planners(
             scenario,
@@ -112,9 +117,13 @@ def compare(
             progress=progress,
         )
         picture = draw_comparison(folder)
-    failures = int(result.runs["plan_failures"].sum())
-    if failures:
-        click.echo(f"note: {failures} steps were driven by the fallback", err=True)
+    for planner, failures in result.runs.groupby("planner", sort=False)["plan_failures"]:
+        if failures.any():
+            click.echo(
+                f"note: {planner} failed in {failures.sum()} steps of {(failures > 0).sum()} runs; "
+                "the table plan says why, and 'run' prints it",
+                err=True,
+            )
     if as_json:
         document = {"runs": _records(result.runs), "summary": _records(result.summary)}
         click.echo(json.dumps(document, ensure_ascii=False))
@@ -148,7 +157,7 @@ def run_batch(
 ) -> None:
     """Do all runs of EXPERIMENT (a TOML file) that are not done yet.
 
-    Interrupt it when you like, and run it again to go on.
+    Interrupt it when you like, and run it again to go on. Exit status 1 if a run has no result.
     """
     from sumo_cohesion.batches import batch as batches
     from sumo_cohesion.experiments.workers import processors
@@ -186,6 +195,8 @@ def run_batch(
     else:
         _print_summary(_summary(rows))
     click.echo(f"metrics in {folder / 'metrics.parquet'}", err=True)
+    if len(left):
+        sys.exit(1)
 
 
 def _parse_shard(text: str) -> tuple[int, int]:
@@ -197,12 +208,17 @@ def _parse_shard(text: str) -> tuple[int, int]:
 
 
 def _summary(rows: pd.DataFrame) -> pd.DataFrame:
-    """Rates and means per scenario and planner, over the whole grid."""
+    """Rates and means of every point of the grid: scenario, planner and parameters."""
     from sumo_cohesion.experiments.statistics import summarize
 
-    done = rows[rows["status"] == "done"].drop_duplicates("run")
-    several = done["scenario"].nunique() > 1
-    names = done["scenario"] + ", " + done["planner"] if several else done["planner"]
+    done, columns = rows[rows["status"] == "done"], list(rows.columns)
+    grid = columns[columns.index("planner") + 1 : columns.index("seed")]
+    names = done["planner"]
+    if done["scenario"].nunique() > 1:
+        names = done["scenario"] + ", " + names
+    for name in grid:
+        if done[name].nunique() > 1:
+            names = names + f", {name}=" + done[name].astype(str)
     return summarize(done.assign(planner=names))
 
 
@@ -349,15 +365,21 @@ def _print_summary(summary: pd.DataFrame) -> None:
     from rich.console import Console
     from rich.table import Table
 
+    if summary.empty:
+        return
     table = Table(title="95 % confidence intervals: Wilson for rates, bootstrap for means")
-    for name in ("metric", *summary["planner"].unique()):
-        table.add_column(name, justify="left" if name == "metric" else "right", no_wrap=True)
-    for metric in summary["metric"].unique():
+    down, across = "metric", "planner"
+    if summary["planner"].nunique() > _SIDE_BY_SIDE:  # one below the other, what matters most
+        down, across = across, down
+        summary = summary[summary["metric"].isin(_IN_SHORT)]
+    for name in (down, *summary[across].unique()):
+        table.add_column(name, justify="left" if name == down else "right", no_wrap=True)
+    for of in summary[down].unique():
         cells = [
             f"{r.value:.2f} [{r.low:.2f}, {r.high:.2f}] n={r.n}" if r.n else "-"
-            for r in summary[summary["metric"] == metric].itertuples()
+            for r in summary[summary[down] == of].itertuples()
         ]
-        table.add_row(metric, *cells)
+        table.add_row(of, *cells)
     # Wide enough for the table where the output is a file or a pipe.
     Console(width=None if sys.stdout.isatty() else 140).print(table)
 

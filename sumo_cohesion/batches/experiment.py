@@ -56,7 +56,7 @@ class Experiment(BaseModel):
     Attributes
     ----------
     scenarios : bundled names, or TOML files looked up beside the experiment's file.
-    planners : built-in names, or ``module:Class``.
+    planners : built-in names, or ``module:Class(...)``.
     seeds : "0:20" (half-open), or a list.
     keep : tables to keep of every run, besides its metrics.
     sumo_outputs : SUMO's own outputs to keep of every run.

@@ -13,7 +13,7 @@ from pathlib import Path
 import sumo_cohesion
 from sumo_cohesion.experiments.rollout import versions
 from sumo_cohesion.experiments.setup import Inputs
-from sumo_cohesion.planning.planners import WITHOUT_COHESION
+from sumo_cohesion.planning.planners import BUILT_IN, WITHOUT_COHESION, parse_planner
 
 _ROOMS = ("traffic", "perception", "social", "planning", "experiments")
 """The package's rooms whose code decides results, beside the shared modules."""
@@ -73,12 +73,12 @@ def planner_digest(name: str) -> str:
     """Digest of the code of a user's own planner; empty for the built-in ones.
 
     Of a planner in a package, the whole package; else its module, and what that imports from its
-    own folder.
+    own folder. And of the files that its arguments name.
     """
-    module, _, class_name = name.partition(":")
-    if not class_name:
+    if name in BUILT_IN:
         return ""
-    top = module.partition(".")[0]
+    planner = parse_planner(name)
+    top = planner.module.partition(".")[0]
     loaded = sys.modules.get(top)
     spec = loaded.__spec__ if loaded is not None else importlib.util.find_spec(top)
     if spec is None:
@@ -89,6 +89,8 @@ def planner_digest(name: str) -> str:
         ]
     else:
         files = list(_imported(Path(spec.origin))) if spec.origin else []
+    named = [value for value in planner.arguments.values() if isinstance(value, str)]
+    files += [Path(value) for value in named if Path(value).is_file()]
     return _digest(json.dumps(sorted([path.name, file_digest(path)] for path in files)).encode())
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import uuid
-from functools import lru_cache
 from pathlib import Path
 from time import perf_counter
 from typing import Any, NamedTuple
@@ -15,9 +14,7 @@ from sumo_cohesion.errors import InputsChangedError, StorageError
 from sumo_cohesion.experiments.rollout import Rollout
 from sumo_cohesion.experiments.setup import prepare
 from sumo_cohesion.experiments.simulation import simulate_with_outputs
-from sumo_cohesion.planning.planners import Planner, make_planner
-from sumo_cohesion.planning.settings import PlannerSettings
-from sumo_cohesion.social.settings import CohesionSettings
+from sumo_cohesion.planning.planners import make_planner
 from sumo_cohesion.traffic.demand import EGO
 from sumo_cohesion.traffic.outputs import Output
 
@@ -60,7 +57,7 @@ def drive(job: Job) -> dict[str, Any]:
     outputs: list[Output] = [
         kind for kind in ("fcd", "tripinfo", "ssm") if SUMO + kind in job.tables
     ]
-    planner = _planner(job.planner, setup.settings, setup.cohesion)
+    planner = make_planner(job.planner, setup.settings, setup.cohesion)
     rollout = simulate_with_outputs(setup, planner, outputs)
     for name in job.tables:
         _keep(rollout, name, table_file(Path(job.folder), name, job.run))
@@ -100,9 +97,3 @@ def _keep(rollout: Rollout, name: str, path: Path) -> None:
         raise StorageError(
             f"{path.parent}: cannot be written ({error.strerror or error})"
         ) from None
-
-
-@lru_cache(maxsize=8)
-def _planner(name: str, settings: PlannerSettings, cohesion: CohesionSettings) -> Planner:
-    """One planner per process, so that its solver is built once for all seeds."""
-    return make_planner(name, settings, cohesion)

@@ -123,6 +123,8 @@ def _grid_columns(metrics: pd.DataFrame) -> list[str]:
 def _paired(own: pd.DataFrame, other: pd.DataFrame, metric: str) -> dict[str, Any]:
     if not (own.index.is_unique and other.index.is_unique):
         raise UserError("a planner has several runs of one seed; tell them apart with by=")
+    if not pd.api.types.is_numeric_dtype(own[metric].dtype):
+        raise UserError(f"{metric!r} is no number and cannot be compared")
     pairs = pd.DataFrame({"a": own[metric], "b": other[metric]})
     whole = pairs.dropna()
     rate = pd.api.types.is_bool_dtype(own[metric].dtype)

@@ -7,9 +7,9 @@ import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
+from urllib.parse import quote
 
 import pandas as pd
 
@@ -20,9 +20,7 @@ from sumo_cohesion.experiments.setup import prepare
 from sumo_cohesion.experiments.simulation import simulate
 from sumo_cohesion.experiments.statistics import summarize
 from sumo_cohesion.experiments.workers import NO_LIMITS, CallFailedError, Workers, processors
-from sumo_cohesion.planning.planners import Planner, make_planner
-from sumo_cohesion.planning.settings import PlannerSettings
-from sumo_cohesion.social.settings import CohesionSettings
+from sumo_cohesion.planning.planners import make_planner
 from sumo_cohesion.traffic.demand import EGO
 
 COMPARISON_FILE = "comparison.json"
@@ -130,7 +128,7 @@ def compare(
 
 def run_folder(folder: Path, planner: str, seed: int) -> Path:
     """Folder of one run within a comparison's folder."""
-    return folder / planner.replace(":", ".") / f"seed_{seed:04d}"
+    return folder / quote(planner.replace(":", ".", 1), safe="()=', ") / f"seed_{seed:04d}"
 
 
 def _keep(new: Path, folder: Path) -> Path | None:
@@ -182,15 +180,8 @@ def _results(jobs: Sequence[_Job], count: int) -> Iterator[tuple[int, _Result]]:
 
 def _run_job(job: _Job) -> _Result:
     setup = prepare(job.scenario, job.planner, job.seed, dict(job.overrides))
-    planner = _planner(job.planner, setup.settings, setup.cohesion)
-    rollout: Rollout = simulate(setup, planner)
+    rollout: Rollout = simulate(setup, make_planner(job.planner, setup.settings, setup.cohesion))
     if job.out is not None:
         rollout.write(job.out)
     table = rollout.trajectory
     return _Result(rollout.metrics, table.loc[table["vehicle"] == EGO, ["time", "d", "speed"]])
-
-
-@lru_cache(maxsize=8)
-def _planner(name: str, settings: PlannerSettings, cohesion: CohesionSettings) -> Planner:
-    """One planner per worker, so that its solver is built once for all seeds."""
-    return make_planner(name, settings, cohesion)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import traceback
 from dataclasses import replace
+from pathlib import Path
 
 from sumo_cohesion.perception.history import History
 from sumo_cohesion.planning import dynamics
@@ -37,8 +39,15 @@ def ask(
     except MemoryError:
         raise  # a car cannot drive on without memory; the run ends
     except Exception as error:
-        usable, status = False, f"{type(error).__name__}: {error}"
+        usable, status = False, f"{type(error).__name__}: {error}{_where(error)}"
     return plan if usable else fallback(observation, road, settings, status)
+
+
+def _where(error: Exception) -> str:
+    """File and line of the planner's module in which an error was raised, or led to it."""
+    frames = traceback.extract_tb(error.__traceback__)[1:]  # the first is ask()
+    own = [frame for frame in frames if frame.filename == frames[0].filename]
+    return f" ({Path(own[-1].filename).name}:{own[-1].lineno})" if own else ""
 
 
 def _is_physical(control: Control) -> bool:

@@ -97,6 +97,22 @@ def require_replaceable(folder: Path, marker: str) -> None:
         )
 
 
+def require_writable(folder: Path) -> None:
+    """Raise UserError unless a result can be written to a folder; its parents are made."""
+    _new_sibling(folder).rmdir()
+
+
+def _new_sibling(folder: Path) -> Path:
+    """Make a hidden folder beside one that may not be there yet."""
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        return Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
+    except OSError as error:
+        raise UserError(
+            f"{folder}: cannot write there ({error.strerror}); choose another --out"
+        ) from None
+
+
 class whole_folder:  # noqa: N801 - reads as a function where it is used
     """Context: write into a temporary sibling that replaces ``folder`` only if all went well."""
 
@@ -104,15 +120,8 @@ class whole_folder:  # noqa: N801 - reads as a function where it is used
         self._folder = folder
 
     def __enter__(self) -> Path:
-        try:
-            self._folder.parent.mkdir(parents=True, exist_ok=True)
-            name = f".{self._folder.name}-"
-            self._new = Path(tempfile.mkdtemp(prefix=name, dir=self._folder.parent))
-            self._new.chmod(0o755)
-        except OSError as error:
-            raise UserError(
-                f"{self._folder}: cannot write there ({error.strerror}); choose another --out"
-            ) from None
+        self._new = _new_sibling(self._folder)
+        self._new.chmod(0o755)
         return self._new
 
     def __exit__(self, kind: type[BaseException] | None, error: object, trace: object) -> None:

@@ -188,11 +188,26 @@ def settings_from(
         head, _, tail = name.partition(".")
         if tail and head in parts:
             parts[head][tail] = value
-        else:
+        elif head in Scenario.model_fields:
             parts[""][name] = value
+        else:
+            raise UserError(f"unknown setting {name!r}{_meant(name)}")
     planner = validated(PlannerSettings, merge({}, parts["planner"]), "planner settings")
     cohesion = validated(CohesionSettings, merge({}, parts["cohesion"]), "cohesion settings")
     return planner, cohesion, parts[""]
+
+
+def _meant(name: str) -> str:
+    """Suggest settings that are spelt like an unknown one, or all there is to set."""
+    groups = {"planner": PlannerSettings.model_fields, "cohesion": CohesionSettings.model_fields}
+    head, dot, tail = name.partition(".")
+    same = [f"{group}.{name}" for group, fields in groups.items() if name in fields]
+    close = difflib.get_close_matches(head, [*groups, *Scenario.model_fields], 1)
+    meant = same or [close[0] + dot + tail] if same or close else []
+    if meant:
+        return f"; did you mean {meant[0]!r}?"
+    known = ", ".join(Scenario.model_fields)
+    return f"; settings are planner.*, cohesion.*, and of the scenario {known}"
 
 
 def merge(data: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:

@@ -20,6 +20,7 @@ from sumo_cohesion.experiments.rollout import (
     Rollout,
     Seconds,
     require_replaceable,
+    require_writable,
 )
 from sumo_cohesion.experiments.setup import Setup, prepare
 from sumo_cohesion.perception.observation import Sensor
@@ -46,7 +47,7 @@ def run(
     Parameters
     ----------
     scenario : bundled name or path of a TOML file.
-    planner : "nominal", "cohesive", "paper", "sumo" or "module:Class".
+    planner : "nominal", "cohesive", "paper", "sumo" or "module:Class(...)".
     seed : varies the traffic; the same seed gives every planner the same traffic.
     overrides : settings by dotted name, e.g. {"cohesion.beta": 0.05}.
     out : folder to write the run's tables to; nothing is written without it.
@@ -64,8 +65,9 @@ def run(
     SimulationError
         If the simulation cannot be trusted.
     """
-    if out is not None:
-        require_replaceable(Path(out), RUN_FILE)  # before the drive, not after
+    if out is not None:  # before the drive, not after
+        require_replaceable(Path(out), RUN_FILE)
+        require_writable(Path(out))
     setup = prepare(scenario, planner, seed, overrides)
     driver = make_planner(planner, setup.settings, setup.cohesion)
     rollout = simulate_with_outputs(setup, driver, sumo_outputs, gui=gui)

@@ -1,18 +1,20 @@
 """Planners: what drives the ego.
 
-A planner of your own is any class with the two methods of `Planner`; name it
-``package.module:Class`` on the command line.
+A planner of your own is any class with the two methods of `Planner`; its name is
+``package.module:Class``, or ``package.module:Class(gain=2.5)`` with arguments.
 """
 
 from __future__ import annotations
 
+import ast
 import importlib
+import re
 import sys
 from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -247,7 +249,7 @@ def cohesion_of(name: str, cohesion: CohesionSettings) -> CohesionSettings:
 
 
 def make_planner(name: str, settings: PlannerSettings, cohesion: CohesionSettings) -> Planner:
-    """Make a planner by name: a built-in one, or ``module:Class`` called without arguments.
+    """Make a planner by name: a built-in one, or ``module:Class(...)``.
 
     Raises
     ------
@@ -289,12 +291,57 @@ def check_planner(name: str) -> None:
         _load_planner(name)
 
 
-def _load_planner(name: str) -> Planner:
-    module_name, _, class_name = name.partition(":")
-    if not (module_name and class_name):
+class OwnPlanner(NamedTuple):
+    """A user's own planner: its module, its class, and the keyword arguments to make it with."""
+
+    module: str
+    name: str
+    arguments: dict[str, Any]
+
+
+def parse_planner(name: str) -> OwnPlanner:
+    """Take the name of a user's own planner apart.
+
+    >>> parse_planner("my.module:Follow(gain=2.5, file='weights.txt')").arguments
+    {'gain': 2.5, 'file': 'weights.txt'}
+
+    Raises
+    ------
+    UserError
+        If it is not of this form; arguments are Python literals by name.
+    """
+    found = re.fullmatch(r"([\w.]+):(\w+)(\(.*\))?", name)
+    if found is None:
         raise UserError(
-            f"unknown planner {name!r}; choose {', '.join(BUILT_IN)} or your own as module:Class"
+            f"unknown planner {name!r}; choose {', '.join(BUILT_IN)} or your own as module:Class, "
+            "or module:Class(gain=2.5)"
         )
+    module, class_name, arguments = found.groups()
+    try:
+        call = ast.parse(f"f{arguments or '()'}", mode="eval").body
+        if not isinstance(call, ast.Call) or call.args:
+            raise ValueError
+        given = {str(k.arg): ast.literal_eval(k.value) for k in call.keywords}
+    except (SyntaxError, ValueError):
+        raise UserError(
+            f"planner {name!r}: write its arguments by name and as Python literals, e.g. "
+            f"{module}:{class_name}(gain=2.5, file='weights.txt')"
+        ) from None
+    return OwnPlanner(module, class_name, given)
+
+
+def split_planners(names: str) -> list[str]:
+    """Split names at commas, but not within parentheses.
+
+    >>> split_planners("nominal, my:Follow(gain=1, lag=2),sumo")
+    ['nominal', 'my:Follow(gain=1, lag=2)', 'sumo']
+    """
+    parts = re.split(r",(?![^()]*\))", names)
+    return [part.strip() for part in parts if part.strip()]
+
+
+def _load_planner(name: str) -> Planner:
+    module_name, class_name, arguments = parse_planner(name)
     # A user's module usually lies in the folder they work in.
     here = str(Path.cwd())
     if here not in sys.path:
@@ -307,11 +354,11 @@ def _load_planner(name: str) -> Planner:
     if not hasattr(module, class_name):
         raise UserError(f"planner {name!r}: {module_name!r} has no {class_name!r}")
     try:
-        planner = getattr(module, class_name)()
+        planner = getattr(module, class_name)(**arguments)
     except (Exception, SystemExit) as error:
         said = f"{type(error).__name__}: {error}"
         raise UserError(
-            f"planner {name!r}: the class must be callable without arguments ({said})"
+            f"planner {name!r}: the class cannot be called with these arguments ({said})"
         ) from None
     if not isinstance(planner, Planner):
         raise UserError(

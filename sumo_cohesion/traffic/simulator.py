@@ -7,6 +7,7 @@ moveToXY: https://sumo.dlr.de/docs/TraCI/Change_Vehicle_State.html#move_to_xy_0x
 from __future__ import annotations
 
 import contextlib
+import threading
 from collections.abc import Mapping
 from dataclasses import dataclass
 from math import cos, degrees, hypot, inf, isfinite, pi, radians, sin
@@ -31,7 +32,7 @@ _KEEP_ROUTE_EXACT = 2
 _SPEED_FACTOR = 3.0
 _NO_OTHERS: Mapping[str, CartesianState] = MappingProxyType({})
 
-_running: str | None = None
+_RUNNING = threading.Lock()  # held as long as a simulation runs
 
 
 class _Manners(NamedTuple):
@@ -118,12 +119,22 @@ class Simulator:
         self._variables: tuple[int, ...] = ()
 
     def __enter__(self) -> Simulator:
-        global _running
-        if _running is not None:
+        if not _RUNNING.acquire(blocking=False):
             raise SimulationError(
                 "a SUMO simulation is already running in this process, and a second one would "
                 "silently replace it; close it first, or use another process"
             )
+        try:
+            sumo = self._started()
+        except BaseException:
+            _RUNNING.release()
+            raise
+        self._sumo = sumo
+        tc = sumo.constants
+        self._variables = (tc.VAR_POSITION, tc.VAR_ANGLE, tc.VAR_SPEED)
+        return self
+
+    def _started(self) -> Any:
         sumo, program = load_window() if self._run.gui else (load_libsumo(), "sumo")
         with captured_stderr() as said:
             try:
@@ -131,11 +142,7 @@ class Simulator:
             except Exception as error:
                 reason = first_error(said()) or str(error)
                 raise UserError(f"SUMO cannot start this scenario: {reason}") from None
-        _running = self._run.demand.name
-        self._sumo = sumo
-        tc = sumo.constants
-        self._variables = (tc.VAR_POSITION, tc.VAR_ANGLE, tc.VAR_SPEED)
-        return self
+        return sumo
 
     def __exit__(
         self,
@@ -143,14 +150,13 @@ class Simulator:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        global _running
         # A moveToXY that no step has taken up crashes the next simulation in this process.
         with contextlib.suppress(Exception):
             if not self._stepped:
                 self._sumo.simulationStep()
         with contextlib.suppress(Exception):
             self._sumo.close()
-        _running = None
+        _RUNNING.release()
 
     def insert_ego(self, latest: float) -> Scene:
         """Step until SUMO has put the ego on the road and return the first scene.

@@ -165,6 +165,9 @@ def test_broken_network_and_route_files(
         (["run", "stalled", "--set", "planner.horizon=0"], ["horizon", "greater than"]),
         (["run", "stalled", "--set", "planner.solver=magic"], ["solver", "fatrop"]),
         (["run", "stalled", "--set", "beta"], ["name=value"]),
+        (["run", "stalled", "--set", "beta=1"], ["did you mean 'cohesion.beta'"]),
+        (["run", "stalled", "--set", "egg.lane=1"], ["did you mean 'ego.lane'"]),
+        (["run", "stalled", "--set", "weather=1"], ["planner.*", "cohesion.*", "duration"]),
         (["run", "stalled", "--sed", "1"], ["--sed"]),
         (["compare", "stalled", "--seeds", "5:5"], ["5:5", "empty"]),
         (["compare", "stalled", "--seeds", "a:b"], ["0:20"]),
@@ -215,8 +218,11 @@ def test_an_unwritable_folder(invoke: Invoke) -> None:
 
 
 @pytest.mark.skipif(not Path("/proc/self").exists(), reason="needs Linux")
-def test_a_folder_that_cannot_be_made(invoke: Invoke) -> None:
-    result = invoke("run", "stalled", "--set", "duration=1.0", "--out", "/proc/nowhere/run")
+def test_a_folder_that_cannot_be_made_is_said_before_the_drive(
+    invoke: Invoke, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sumo_cohesion.experiments.simulation.simulate", None)
+    result = invoke("run", "stalled", "--out", "/proc/nowhere/run")
     assert_one_line(result, "/proc/nowhere/run", "cannot write there")
 
 

@@ -50,6 +50,11 @@ def results(folder: Path) -> pd.DataFrame:
     return load_metrics(folder).drop(columns=list(NOT_REPEATABLE))
 
 
+def results_of(experiment: Mapping[str, Any], folder: Path, workers: int) -> pd.DataFrame:
+    batch(experiment, folder, workers=workers)
+    return results(folder)
+
+
 @pytest.fixture(scope="module")
 def uninterrupted(tmp_path_factory: pytest.TempPathFactory) -> pd.DataFrame:
     folder = tmp_path_factory.mktemp("batch") / "whole"
@@ -322,6 +327,67 @@ def test_a_planners_own_code_decides_which_run_it_is(tmp_path: Path) -> None:
     assert len({key for keys in run_keys for key in keys}) == 4
 
 
+def test_a_planners_arguments_and_the_files_they_name_decide_which_run_it_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    weights = tmp_path / "weights.txt"
+
+    def keys(*arguments: str) -> list[str]:
+        asked = [f"{FAULTY}Learned({given})" for given in arguments]
+        experiment = {"scenarios": ["stalled"], "seeds": [0], "planners": asked}
+        return list(spell_out(load_experiment(experiment)).plan["run"])
+
+    weights.write_text("0.5")
+    first = keys("gain=0.5", "gain=1.0", "file='weights.txt'")
+    weights.write_text("0.75")
+    second = keys("gain=0.5", "gain=1.0", "file='weights.txt'")
+    assert first[:2] == second[:2]
+    assert len({*first, *second}) == 4
+    experiment = {
+        "scenarios": ["stalled"],
+        "seeds": [0],
+        "planners": [f"{FAULTY}Learned(gain=0.0)", f"{FAULTY}Learned(gain=4.0)"],
+        "set": {"duration": 2.0},
+    }
+    slow, fast = batch(experiment, tmp_path / "out", workers=1)["mean_speed"]
+    assert fast > slow + 1.0
+
+
+def test_no_run_sees_what_a_planner_remembers_of_another(tmp_path: Path) -> None:
+    """A planner that forgets to forget in reset gives the same with any number of workers."""
+    experiment = {
+        "scenarios": ["stalled"],
+        "seeds": "0:4",
+        "planners": [FAULTY + "Forgetful"],
+        "set": {"duration": 2.0},
+    }
+    one, two = (results_of(experiment, tmp_path / str(n), workers=n) for n in (1, 2))
+    pd.testing.assert_frame_equal(one, two)
+    alone = run("stalled", FAULTY + "Forgetful", 3, overrides={"duration": 2.0}).metrics
+    assert one["mean_speed"].iloc[3] == alone["mean_speed"].iloc[0]
+
+
+def test_a_batch_whose_runs_fail_exits_with_1_and_its_summary_is_by_grid_point(
+    tmp_path: Path,
+) -> None:
+    good = SHORT | {"scenarios": ["stalled"], "seeds": "0:2"}
+    file = toml(good, tmp_path / "good.toml")
+    done = subprocess.run(
+        command(file, tmp_path / "good"), cwd=REPOSITORY, capture_output=True, text=True, check=True
+    )
+    assert "cohesive, cohesion.beta=0.03" in done.stdout
+    assert done.stdout.count("n=2") > 4
+    assert "n=4" not in done.stdout
+    bad = good | {"planners": [FAULTY + "RaisesAtOnce"], "grid": {}}
+    file = toml(bad, tmp_path / "bad.toml")
+    failed = subprocess.run(
+        command(file, tmp_path / "bad"), cwd=REPOSITORY, capture_output=True, text=True, check=False
+    )
+    assert failed.returncode == 1
+    assert "no such road" in failed.stderr
+
+
 def test_what_was_retried_with_success_is_done_whoever_failed_first(tmp_path: Path) -> None:
     small = SHORT | {"scenarios": ["stalled"], "planners": ["sumo"], "grid": {}, "seeds": [0, 1]}
     out = tmp_path / "out"
@@ -377,7 +443,11 @@ def test_a_reason_that_is_no_text_does_not_spoil_the_batch(tmp_path: Path) -> No
         ({"grid": {"cohesion.beta": [i / 1e6 for i in range(20_001)]}}, "too many"),
         ({"planners": ["nominl"]}, "unknown planner 'nominl'"),
         ({"planners": [FAULTY + "NoSuch"]}, "has no 'NoSuch'"),
-        ({"planners": [FAULTY + "CannotBeMade"]}, "callable without arguments"),
+        ({"planners": [FAULTY + "Good(1)"]}, "arguments by name"),
+        ({"planners": [FAULTY + "Good(x=1)"]}, "cannot be called with these arguments"),
+        ({"grid": {"chesion.beta": [1.0]}}, "did you mean 'cohesion.beta'"),
+        ({"grid": {"beta": [1.0]}}, "did you mean 'cohesion.beta'"),
+        ({"planners": [FAULTY + "CannotBeMade"]}, "cannot be called with these arguments"),
         ({"keep": ["everything"]}, "keep"),
         ({"colour": 1}, "unknown key 'colour'"),
     ],

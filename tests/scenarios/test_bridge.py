@@ -7,12 +7,15 @@ import subprocess
 import sys
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 
+from sumo_cohesion import run
 from sumo_cohesion.errors import SimulationError, UserError
 from sumo_cohesion.experiments.setup import prepare
 from sumo_cohesion.state import CartesianState, Scene
@@ -207,6 +210,26 @@ def test_one_simulation_per_process(tmp_path: Path) -> None:
             pass
         sumo.step(None)  # the first one is unharmed
         assert sumo.read().time == pytest.approx(0.2)
+
+
+def test_two_threads_never_share_a_simulation() -> None:
+    """One of them gets its own run, whole; the other is told."""
+    alone = run("stalled", "nominal", 3, overrides={"duration": 2.0}).trajectory
+
+    def attempt(_: int) -> pd.DataFrame | str:
+        try:
+            return run("stalled", "nominal", 3, overrides={"duration": 2.0}).trajectory
+        except SimulationError as error:
+            return str(error)
+
+    for _ in range(3):
+        with ThreadPoolExecutor(2) as threads:
+            found = list(threads.map(attempt, range(2)))
+        tables = [one for one in found if isinstance(one, pd.DataFrame)]
+        assert tables
+        for table in tables:
+            pd.testing.assert_frame_equal(table, alone)
+        assert all("already running" in one for one in found if isinstance(one, str))
 
 
 def test_leaving_with_a_move_pending_does_not_crash_the_next_run(tmp_path: Path) -> None:

@@ -29,6 +29,12 @@ def metrics(
     return table.astype({column: "boolean"}) if column == "success" else table
 
 
+def test_what_is_no_number_cannot_be_compared() -> None:
+    outcomes = metrics(["collision"] * 3, ["finished"] * 3, "outcome")
+    with pytest.raises(UserError, match="'outcome' is no number"):
+        compare_planners(outcomes, ["outcome"])
+
+
 def test_rates_that_never_agree() -> None:
     (row,) = compare_planners(metrics([False] * 50, [True] * 50), ["success"]).itertuples()
     assert (row.kind, row.n, row.excluded) == ("rate", 50, 0)

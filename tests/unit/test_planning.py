@@ -290,9 +290,12 @@ def test_planners_by_name() -> None:
     [
         ("nominl", "unknown planner 'nominl'"),
         ("no_such_module:Planner", "cannot import 'no_such_module'"),
+        ("no_such_module:Planner(2)", "arguments by name"),
+        ("no_such_module:Planner(a=b)", "arguments by name"),
+        ("no_such_module:Planner(", "unknown planner"),
         ("json:Planner", "'json' has no 'Planner'"),
         ("json:JSONDecoder", "needs the methods"),
-        ("datetime:datetime", "callable without arguments"),
+        ("datetime:datetime", "cannot be called with these arguments"),
     ],
 )
 def test_planner_names_that_are_wrong(name: str, message: str) -> None:
