@@ -21,6 +21,8 @@ SPACING = 1.0
 """Metres between vertices of the reference line."""
 
 
+TOO_NEAR = 6.0
+"""Metres between two stretches of a road below which they cannot be told apart (returns)."""
 MISS = 1.0
 """Metres beside the reference line up to which a path still keeps to the road (too_sharp)."""
 
@@ -215,6 +217,18 @@ class Road:
                     sharpest = max(range(begun, k + 1), key=lambda m: side * bends[m])
                     return self.s0 + (i + sharpest) * SPACING
         return None
+
+    def returns(self, first: float, last: float) -> float | None:
+        """Where (s, m) between two places the road comes back to, or crosses, where it was before.
+
+        Nearer than TOO_NEAR, so that a car beside it could be in either place. None if nowhere.
+        """
+        i, j = (min(max(round((s - self.s0) / SPACING), 0), self.x.size - 1) for s in (first, last))
+        pairs = self._tree.query_pairs(TOO_NEAR, output_type="ndarray")
+        later = pairs[:, 1][(pairs[:, 0] >= i) & (pairs[:, 1] <= j)]
+        apart = (pairs[:, 1] - pairs[:, 0])[(pairs[:, 0] >= i) & (pairs[:, 1] <= j)]
+        met = later[apart * SPACING > 6.0 * TOO_NEAR]
+        return self.s0 + float(met.min()) * SPACING if met.size else None
 
     def project(self, x: float, y: float) -> tuple[float, float, float, float]:
         """Road coordinates of one Cartesian point.

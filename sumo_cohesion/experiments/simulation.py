@@ -7,6 +7,7 @@ import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from math import inf
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -25,11 +26,16 @@ from sumo_cohesion.experiments.rollout import (
 from sumo_cohesion.experiments.setup import Setup, prepare
 from sumo_cohesion.perception.observation import Sensor
 from sumo_cohesion.planning.planners import Planner, make_planner
+from sumo_cohesion.road import Road
 from sumo_cohesion.social.memory import new_history
+from sumo_cohesion.state import RoadState
 from sumo_cohesion.traffic.contact import contacts
 from sumo_cohesion.traffic.drivers import Drivers
 from sumo_cohesion.traffic.outputs import Output, SumoOutputs
 from sumo_cohesion.traffic.simulator import STEP_LENGTH, Simulator
+
+_LOST = 10.0
+"""Metres from the nearest lane of its route, or off it, beyond which the ego has left both."""
 
 
 def run(
@@ -121,8 +127,8 @@ def simulate(setup: Setup, planner: Planner, *, gui: bool = False) -> Rollout:
             recorder.add(scene, observation, history, plan, others, seconds)
             scene = following
             touched = contacts(scene.ego, scene.ego_size, scene.states, scene.sizes)
-            at_end = observation.ego.s > road.length - END_OF_ROUTE
-            outcome = _outcome(bool(touched.size), at_end, scene.time > end - STEP_LENGTH / 2)
+            finished = scene.time > end - STEP_LENGTH / 2
+            outcome = _outcome(bool(touched.size), observation.ego, road, finished)
         fleet.meet(scene, sumo)  # who touched whom in the last step
         names, told = [scene.ids[i] for i in touched], sumo.reported_contacts()
         return recorder.finish(
@@ -148,10 +154,14 @@ def _older_objects_left_alone() -> Iterator[None]:
         gc.unfreeze()
 
 
-def _outcome(touched: bool, at_end: bool, finished: bool) -> str:
+def _outcome(touched: bool, ego: RoadState, road: Road, finished: bool) -> str:
     """Why the run ends here; empty if it goes on."""
     if touched:
         return "collision"
-    if at_end:
-        return "route_end"
+    aside = abs(ego.d - road.nearest_lane(ego.s, ego.d))
+    if _LOST < aside < inf:
+        return "left_route"
+    if ego.s > road.length - END_OF_ROUTE:
+        on_route = road.lane_of(ego.s, ego.d) < road.n_route_lanes
+        return "route_end" if on_route else "left_route"
     return "finished" if finished else ""

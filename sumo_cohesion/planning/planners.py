@@ -237,6 +237,8 @@ BUILT_IN = {
     "sumo": "SUMO's own driver model",
 }
 
+_STREETS = 0.2
+"""Curvature (1/m) of a car's tightest turn."""
 WITHOUT_COHESION = ("nominal", "sumo")
 """Built-in planners whose runs are the same whatever the cohesion settings say."""
 
@@ -266,22 +268,30 @@ def make_planner(name: str, settings: PlannerSettings, cohesion: CohesionSetting
 def check_road(
     name: str, settings: PlannerSettings, road: Road, first: float, seconds: float
 ) -> None:
-    """Raise UserError if a built-in planner could not keep to the road from a place on.
+    """Raise UserError if a car cannot be told, or driven by this planner, along a road.
 
     ``first`` is where (s, m) it starts, ``seconds`` how long it may drive at the speed limit.
     """
-    if name == "sumo" or name not in BUILT_IN:
-        return
     last = min(first + seconds * float(road.speed_limit.max()), road.length)
-    s = road.too_sharp(settings.max_curvature, first, last)
+    s = road.returns(first, last)
     if s is not None:
-        sharpest = settings.max_curvature
         raise UserError(
-            f"{s:.0f} m from its start the route turns with a radius of "
-            f"{1.0 / abs(road.bend_at(s)):.0f} m, and planner.max_curvature = {sharpest:g} allows "
-            f"{1.0 / sharpest:.0f} m; for streets set planner.max_curvature = 0.2 and "
-            "planner.max_curvature_rate = 1, or choose another route"
+            f"{s:.0f} m from its start the route comes back to where it was before (a U-turn, or a "
+            "bridge over itself), and which of both a car is at cannot be told; choose another "
+            "route, or a shorter duration"
         )
+    s = road.too_sharp(settings.max_curvature, first, last)
+    if s is None or name == "sumo" or name not in BUILT_IN:
+        return
+    radius, allowed = 1.0 / abs(road.bend_at(s)), 1.0 / settings.max_curvature
+    turns = f"{s:.0f} m from its start the route turns with a radius of {radius:.0f} m"
+    if settings.max_curvature >= _STREETS:
+        raise UserError(f"{turns}, which no car can; choose another route")
+    raise UserError(
+        f"{turns}, and planner.max_curvature = {settings.max_curvature:g} allows {allowed:.0f} m; "
+        f"for streets set planner.max_curvature = {_STREETS:g} and planner.max_curvature_rate = 1, "
+        "or choose another route"
+    )
 
 
 @lru_cache(maxsize=32)

@@ -90,12 +90,19 @@ def check_demand(
         raise UserError(
             f"ego.lane = {ego.lane}, but edge {ego.origin!r} has lanes 0 to {n_lanes - 1}"
         )
+    for_cars = network.lanes_for_cars(ego.origin)
+    if ego.lane not in for_cars:
+        raise UserError(
+            f"ego.lane = {ego.lane}, which is not for cars on edge {ego.origin!r}; choose "
+            + " or ".join(map(str, for_cars))
+        )
     if ego.position > length:
         raise UserError(
             f"ego.position = {ego.position:g}, but edge {ego.origin!r} is {length:.1f} m long"
         )
     edges = set(network.edges())
     ids: set[str] = set()
+    flows: set[str] = set()
     for path in route_files:
         for element in check_xml(path, "routes").iter():
             if element.tag == "route" or element.get("edges") is not None:
@@ -106,13 +113,18 @@ def check_demand(
                             "does not have"
                         )
             if element.tag in ("vehicle", "trip", "flow"):
-                ids.add(element.get("id", ""))
+                (flows if element.tag == "flow" else ids).add(element.get("id", ""))
             _require_finite(path, element)
     if EGO in ids:
         raise UserError(f"a route file has a vehicle {EGO!r}; the scenario's [ego] adds it")
-    missing = sorted(set(named) - ids)
-    if missing:
-        raise UserError(f"the scenario names vehicle {missing[0]!r}, which no route file has")
+    for name in sorted(named):
+        if name in flows:
+            raise UserError(
+                f"the scenario names {name!r}, which is a flow; name its vehicles: "
+                f"{name}.0, {name}.1 and so on"
+            )
+        if name not in ids and name.rpartition(".")[0] not in flows:
+            raise UserError(f"the scenario names vehicle {name!r}, which no route file has")
     return route
 
 
@@ -309,5 +321,10 @@ def _add_ego(routes: ET.Element, route: Sequence[str], ego: EgoDemand) -> None:
 
 
 def _departure(element: ET.Element) -> float:
-    text = element.get("depart") or element.get("begin")
-    return float(text or 0.0) if _numeric(text) else 0.0
+    """Seconds, which SUMO also takes as [days:]hours:minutes:seconds; 0 for what is no time."""
+    text = element.get("depart") or element.get("begin") or "0"
+    parts = text.split(":")
+    if len(parts) not in (1, 3, 4) or not all(map(_numeric, parts)):
+        return 0.0
+    units = (1.0, 60.0, 3600.0, 86_400.0)
+    return sum(float(part) * unit for part, unit in zip(reversed(parts), units, strict=False))

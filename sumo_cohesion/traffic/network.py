@@ -83,6 +83,10 @@ class Network:
         """Return the number of lanes of an edge."""
         return int(self._edge(edge).getLaneNumber())
 
+    def lanes_for_cars(self, edge: str) -> list[int]:
+        """Return the lanes of an edge that cars may use, from right to left."""
+        return [int(lane.getIndex()) for lane in _car_lanes(self._edge(edge))]
+
     def edge_length(self, edge: str) -> float:
         """Length (m) of an edge."""
         return float(self._edge(edge).getLength())

@@ -19,6 +19,7 @@ import numpy as np
 
 from sumo_cohesion.errors import SimulationError, UserError
 from sumo_cohesion.state import CartesianState, Scene
+from sumo_cohesion.traffic.contact import contacts
 from sumo_cohesion.traffic.demand import EGO
 from sumo_cohesion.traffic.library import captured_stderr, first_error, load_libsumo, load_window
 from sumo_cohesion.traffic.outputs import SumoOutputs
@@ -150,13 +151,24 @@ class Simulator:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        # A moveToXY that no step has taken up crashes the next simulation in this process.
         with contextlib.suppress(Exception):
-            if not self._stepped:
-                self._sumo.simulationStep()
+            self._take_up_moves()
         with contextlib.suppress(Exception):
             self._sumo.close()
         _RUNNING.release()
+
+    def _take_up_moves(self) -> None:
+        """Step once more: a moveToXY not taken up crashes the next simulation in this process."""
+        vehicle = self._sumo.vehicle
+        for _ in range(10):
+            if self._stepped:
+                return
+            with contextlib.suppress(SimulationError):
+                self._step()
+                return
+            # What SUMO stumbles over is what it is about to insert.
+            for name in {*vehicle.getLoadedIDList()} - {*vehicle.getIDList()}:
+                vehicle.remove(name)
 
     def insert_ego(self, latest: float) -> Scene:
         """Step until SUMO has put the ego on the road and return the first scene.
@@ -177,7 +189,14 @@ class Simulator:
         self._sumo.vehicle.subscribeContext(
             EGO, self._sumo.constants.CMD_GET_VEHICLE_VARIABLE, self._radius, self._variables
         )
-        return self.read()
+        scene = self.read()
+        inside = contacts(scene.ego, scene.ego_size, scene.states, scene.sizes)
+        if inside.size:
+            raise UserError(
+                f"at its start the ego would overlap vehicle {scene.ids[inside[0]]!r}; choose "
+                "another ego.position, ego.lane or ego.depart"
+            )
+        return scene
 
     def _take_over(self, name: str) -> None:
         """Switch off SUMO's own control of a car, unless it is off.

@@ -240,6 +240,27 @@ def test_leaving_with_a_move_pending_does_not_crash_the_next_run(tmp_path: Path)
             sumo._stepped = False
 
 
+def test_a_step_that_fails_with_a_move_pending_does_not_crash_the_next_run(tmp_path: Path) -> None:
+    bad = vehicle("late", 9, 100, 25).replace('depart="0"', 'depart="1"')
+    for _ in range(3):
+        with (  # noqa: PT012 - what raises is the step at which SUMO inserts the bad vehicle
+            simulation(tmp_path, vehicle("ego", 1, 100, 25), bad) as sumo,
+            pytest.raises(SimulationError, match="departLane definition for vehicle 'late'"),
+        ):
+            ego = sumo.insert_ego(latest=5.0).ego
+            for _ in range(20):
+                ego = ego._replace(x=ego.x + 2.5)
+                sumo.step(ego)
+
+
+def test_an_ego_that_would_start_inside_a_car_is_reported(tmp_path: Path) -> None:
+    with (
+        simulation(tmp_path, vehicle("ego", 1, 100, 25), vehicle("b", 1, 98, 25)) as sumo,
+        pytest.raises(UserError, match="overlap vehicle 'b'"),
+    ):
+        sumo.insert_ego(latest=3.0)
+
+
 def test_an_ego_that_cannot_depart_is_reported(tmp_path: Path) -> None:
     with (
         simulation(tmp_path, vehicle("b", 1, 100, 25)) as sumo,

@@ -8,6 +8,9 @@ import numpy as np
 import pytest
 
 from sumo_cohesion import UserError, run
+from sumo_cohesion.perception.history import History
+from sumo_cohesion.road import Road
+from sumo_cohesion.state import Control, Observation, Plan
 
 SCENARIO = """
 name = "city"
@@ -67,3 +70,47 @@ def test_a_turn_that_is_too_sharp_for_the_planner_says_so(tmp_path: Path, city: 
     # What is too far away to be reached does not matter, nor does it to SUMO's driver.
     assert len(run(path, "nominal", overrides={"duration": 1.0}).plan) == 10
     assert len(run(path, "sumo", overrides={"duration": 15.0}).plan) == 150
+
+
+class StraightOn:
+    """Does not turn where the route does."""
+
+    def reset(self, road: Road) -> None:
+        pass
+
+    def plan(self, observation: Observation, history: History) -> Plan:
+        return Plan((Control(0.0, 0.1 * observation.ego.speed),), [], "straight on")
+
+
+def test_a_run_ends_when_the_ego_has_left_its_route_and_every_lane_off_it(
+    tmp_path: Path, city: Path
+) -> None:
+    path = scenario(tmp_path, city, "A1B1", 0)
+    rollout = run(path, f"{__name__}:StraightOn", overrides={"ego.speed": 13.0})
+    metrics = rollout.metrics.iloc[0]
+    assert metrics["outcome"] == "left_route"
+    assert metrics["exited"]
+    # Straight on there is a street, along which it may go as far as that is known.
+    assert metrics["travel_time"] > 12.0
+    assert rollout.trajectory["time"].max() < 45.0
+
+
+def test_what_a_road_cannot_be_told_of_or_driven_along_says_so(tmp_path: Path, city: Path) -> None:
+    path = scenario(tmp_path, city, "A1A0", 0)  # back the same way: a U-turn
+    for planner in ("nominal", "sumo"):
+        with pytest.raises(UserError, match="comes back to where it was before"):
+            run(path, planner)
+
+
+def test_the_scenario_speaks_of_a_flows_vehicles_not_of_the_flow(
+    tmp_path: Path, city: Path
+) -> None:
+    path = scenario(tmp_path, city, "A1B1", 1)
+    flow = '<flow id="f" type="human" route="along" begin="0" end="9" period="3"/></routes>'
+    (tmp_path / "city.rou.xml").write_text(DEMAND.replace("</routes>", flow))
+    overrides = {"duration": 5.0, "sensing.hidden": ["f"]}
+    with pytest.raises(UserError, match=r"'f', which is a flow; name its vehicles: f.0, f.1"):
+        run(path, "sumo", overrides=overrides)
+    overrides["sensing.hidden"] = ["f.0"]
+    seen = run(path, "sumo", overrides=overrides).trajectory.groupby("vehicle")["visible"].any()
+    assert (seen["f.0"], seen["f.1"]) == (False, True)

@@ -105,6 +105,15 @@ def test_numbers_must_be_finite(value: float | str) -> None:
         check_human_type({"lcSigma": value})
 
 
+def test_departures_are_sorted_however_their_time_is_written(build: Build) -> None:
+    times = ("1:00:00:00", "00:10:00", "300", "00:01:30.5", "triggered")
+    departures = [f'<vehicle id="v{i}" depart="{time}"/>' for i, time in enumerate(times)]
+    demand = build("".join(departures), {})
+    order = [v.get("depart") for v in demand.iter("vehicle") if v.get("id") != "ego"]
+    # What is no time stays in front: SUMO says what it thinks of it.
+    assert order == ["triggered", "00:01:30.5", "300", "00:10:00", "1:00:00:00"]
+
+
 def test_names_are_those_of_sumos_schema() -> None:
     assert {"lcSigma", "sigma", "tau", "speedDev", "color"} <= vehicle_type_attributes()
     check_human_type({"lcSigma": 0.3, "carFollowModel": "IDM"})

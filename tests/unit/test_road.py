@@ -153,6 +153,20 @@ def test_where_a_road_turns_too_sharply(curve: Road, city: Path) -> None:
     assert straight.too_sharp(0.001, 0.0, straight.length) is None
 
 
+def test_where_a_road_comes_back_to_itself(highway: Road, curve: Road, city: Path) -> None:
+    for road in (highway, curve):
+        assert road.returns(0.0, road.length) is None
+    streets = Network(city)
+    block = ("A0A1", "A1B1", "B1B0", "B0A0")
+    around = streets.road(block)
+    assert around.returns(0.0, around.length - 20.0) is None
+    # Around the block and on along the first street: there again after four streets.
+    again = streets.road((*block, "A0A1"))
+    where = again.returns(0.0, again.length)
+    assert where == pytest.approx(around.length, abs=15.0)
+    assert again.returns(0.0, 400.0) is None
+
+
 def test_routes_that_do_not_exist_say_so() -> None:
     network = Network(NETWORKS / "curve.net.xml")
     with pytest.raises(UserError, match="no way for a car from edge 'ramp' to edge 'bend_2'"):
