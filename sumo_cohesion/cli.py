@@ -100,8 +100,7 @@ def compare(
 ) -> None:
     """Run several planners on the same seeds of SCENARIO and compare them."""
     from sumo_cohesion.experiments.comparison import compare as compare_planners
-    from sumo_cohesion.experiments.scenario import parse_seeds
-    from sumo_cohesion.planning.planners import split_planners
+    from sumo_cohesion.experiments.scenario import parse_seeds, split_planners
     from sumo_cohesion.report.paths import draw_comparison
 
     folder = out if out is not None else Path("results") / Path(scenario).stem

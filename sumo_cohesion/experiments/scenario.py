@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import re
 import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -245,6 +246,16 @@ def parse_override(text: str) -> tuple[str, Any]:
     except tomllib.TOMLDecodeError:
         parsed = value.strip()
     return name.strip(), parsed
+
+
+def split_planners(names: str) -> list[str]:
+    """Split names at commas, but not within parentheses.
+
+    >>> split_planners("nominal, my:Follow(gain=1, lag=2),sumo")
+    ['nominal', 'my:Follow(gain=1, lag=2)', 'sumo']
+    """
+    parts = re.split(r",(?![^()]*\))", names)
+    return [part.strip() for part in parts if part.strip()]
 
 
 def parse_seeds(text: str, what: str = "--seeds") -> list[int]:

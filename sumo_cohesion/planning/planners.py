@@ -340,16 +340,6 @@ def parse_planner(name: str) -> OwnPlanner:
     return OwnPlanner(module, class_name, given)
 
 
-def split_planners(names: str) -> list[str]:
-    """Split names at commas, but not within parentheses.
-
-    >>> split_planners("nominal, my:Follow(gain=1, lag=2),sumo")
-    ['nominal', 'my:Follow(gain=1, lag=2)', 'sumo']
-    """
-    parts = re.split(r",(?![^()]*\))", names)
-    return [part.strip() for part in parts if part.strip()]
-
-
 def _load_planner(name: str) -> Planner:
     module_name, class_name, arguments = parse_planner(name)
     # A user's module usually lies in the folder they work in.
