@@ -71,6 +71,13 @@ def run(
     with _clean_stdout():
         rollout = run_once(scenario, planner, seed, overrides=_overrides(changes), out=out, gui=gui)
     _warn_of_failures(rollout.plan)
+    lights = rollout.info["traffic_lights"]
+    if lights and planner != "sumo":
+        click.echo(
+            f"note: the ego's route passes {len(lights)} traffic lights, which its planner does "
+            "not know and does not stop at",
+            err=True,
+        )
     row = _records(rollout.metrics)[0]
     if as_json:
         click.echo(json.dumps({"metrics": row}, ensure_ascii=False))

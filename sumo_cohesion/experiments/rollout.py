@@ -226,6 +226,7 @@ class Recorder:
             "special": list(setup.scenario.sensing.special),
             "solver": self._plans[0][2].solver if self._plans else "",
             "n_route_lanes": setup.road.n_route_lanes,
+            "traffic_lights": list(setup.traffic_lights),
             "versions": versions(),
         }
         metrics = run_metrics(info, trajectory, plan, agreement, timing, reference)

@@ -45,12 +45,14 @@ class Inputs:
 class Setup(Inputs):
     """One run, checked and ready: everything that decides its result.
 
-    ``outputs`` only adds to what is written.
+    ``traffic_lights`` are those of the route, which planned cars do not know; ``outputs`` only
+    adds to what is written.
     """
 
     seed: int
     route: tuple[str, ...]
     road: Road
+    traffic_lights: tuple[str, ...] = ()
     outputs: SumoOutputs | None = None
 
     @property
@@ -149,7 +151,8 @@ def prepare(
     route = check_demand(network, inputs.routes, loaded.ego, named)
     road = _road(inputs.network, *_version(inputs.network), tuple(route))
     check_road(planner, inputs.settings, road, loaded.ego.position, loaded.duration)
-    return Setup(**vars(inputs), seed=seed, route=tuple(route), road=road)
+    lights = tuple(network.traffic_lights(route))
+    return Setup(**vars(inputs), seed=seed, route=tuple(route), road=road, traffic_lights=lights)
 
 
 def _version(path: Path) -> tuple[int, int]:

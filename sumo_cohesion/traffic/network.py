@@ -8,6 +8,7 @@ from __future__ import annotations
 import xml.etree.ElementTree as ET
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -101,6 +102,16 @@ class Network:
                 f"{self.path}: no way for a car from edge {origin!r} to edge {destination!r}"
             )
         return [str(e.getID()) for e in path]
+
+    def traffic_lights(self, route: Sequence[str]) -> list[str]:
+        """Ids of the traffic lights that a route passes, in order."""
+        edges = [self._edge(e) for e in route]
+        found: dict[str, None] = {}
+        for edge, following in pairwise(edges):
+            for connection in edge.getConnections(following):
+                if connection.getTLSID():
+                    found[str(connection.getTLSID())] = None
+        return list(found)
 
     def road(self, route: Sequence[str]) -> Road:
         """Build the Road along a route; its s = 0 is the start of the first edge."""

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sumo_cohesion import UserError, run
+from sumo_cohesion import UserError, cli, run
 from sumo_cohesion.perception.history import History
 from sumo_cohesion.road import Road
 from sumo_cohesion.state import Control, Observation, Plan
@@ -35,6 +35,7 @@ DEMAND = """
   <vehicle id="lead_1" type="human" route="along" depart="0" departPos="80" departLane="0"/>
 </routes>
 """
+BRIEF = ("--set", "duration=1.0")
 STREETS = {"planner.max_curvature": 0.2, "planner.max_curvature_rate": 1.0}
 
 
@@ -70,6 +71,20 @@ def test_a_turn_that_is_too_sharp_for_the_planner_says_so(tmp_path: Path, city: 
     # What is too far away to be reached does not matter, nor does it to SUMO's driver.
     assert len(run(path, "nominal", overrides={"duration": 1.0}).plan) == 10
     assert len(run(path, "sumo", overrides={"duration": 15.0}).plan) == 150
+
+
+def test_the_lights_that_the_planner_does_not_know_are_said(
+    tmp_path: Path, city: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    path = scenario(tmp_path, city, "A3A4", 1)
+    lights = run(path, "sumo", overrides={"duration": 1.0}).info["traffic_lights"]
+    assert lights
+    assert set(lights) <= {"A1", "A2", "A3"}
+    monkeypatch.setattr(
+        "sys.argv", ["sumo-cohesion", "run", str(path), "--planner", "nominal", *BRIEF]
+    )
+    cli.main()
+    assert f"passes {len(lights)} traffic lights" in capfd.readouterr().err
 
 
 class StraightOn:
