@@ -29,7 +29,7 @@ from sumo_cohesion.experiments.setup import resolve
 from sumo_cohesion.planning.planners import check_planner
 from sumo_cohesion.traffic.outputs import Output
 
-Kept = Literal["ego", "trajectory", "plan", "agreement", "timing", "reference"]
+Kept = Literal["ego", "trajectory", "plan", "horizon", "agreement", "timing", "reference"]
 """Tables that can be kept per run; ``ego`` is the ego's part of the trajectory."""
 Value = bool | int | float | str | list[Any]
 MOST_POINTS, MOST_RUNS = 20_000, 5_000_000

@@ -52,7 +52,7 @@ def load_trajectories(
     folder : of a batch that kept the table, a comparison or a run.
     where : which runs, by ``scenario``, ``planner``, ``seed`` or a grid's name: a value or a
         list of values, e.g. {"planner": "cohesive", "cohesion.beta": [0.03, 0.09]}.
-    table : "trajectory", "plan", "agreement", "timing", "reference", "sumo_fcd",
+    table : "trajectory", "plan", "horizon", "agreement", "timing", "reference", "sumo_fcd",
         "sumo_tripinfo" or "sumo_ssm"; of a batch also "ego".
 
     Returns

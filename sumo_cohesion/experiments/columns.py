@@ -59,6 +59,15 @@ PLAN = (
     Column("reward_constraints", "float64", "", "penalties for being too close to a visible car"),
 )
 
+HORIZON = (
+    Column("time", "float64", "s", "SUMO time at which the plan was made"),
+    Column("stage", "int64", "", "steps from then: 1 is where the driven control leads"),
+    Column("s", "float64", "m", "planned, along the ego's route"),
+    Column("d", "float64", "m", "planned, left of the reference line"),
+    Column("road_heading", "float64", "rad", "planned, relative to the road"),
+    Column("speed", "float64", "m/s", "planned"),
+)
+
 AGREEMENT = (
     Column("time", "float64", "s", "SUMO time"),
     Column("group", "string", "", "position, lane or road"),
@@ -198,6 +207,7 @@ OF_REFERENCE = (
 TABLES = {
     "trajectory": TRAJECTORY,
     "plan": PLAN,
+    "horizon": HORIZON,
     "agreement": AGREEMENT,
     "timing": TIMING,
     "reference": REFERENCE,

@@ -48,14 +48,15 @@ class Rollout:
     Attributes
     ----------
     info : scenario, planner, settings, seed, versions and outcome, ready for JSON.
-    trajectory, plan, agreement, timing, reference, metrics : tables; see docs/tables.md for
-        their columns.
+    trajectory, plan, horizon, agreement, timing, reference, metrics : tables; see docs/tables.md
+        for their columns.
     sumo : SUMO's own outputs that were asked for, by kind (traffic.outputs).
     """
 
     info: dict[str, Any]
     trajectory: pd.DataFrame
     plan: pd.DataFrame
+    horizon: pd.DataFrame
     agreement: pd.DataFrame
     timing: pd.DataFrame
     reference: pd.DataFrame
@@ -230,7 +231,8 @@ class Recorder:
             "versions": versions(),
         }
         metrics = run_metrics(info, trajectory, plan, agreement, timing, reference)
-        return Rollout(info, trajectory, plan, agreement, timing, reference, metrics)
+        horizon = self._horizon_table()
+        return Rollout(info, trajectory, plan, horizon, agreement, timing, reference, metrics)
 
     def _recorded(self, scene: Scene) -> Scene:
         """Keep what is recorded: as far around the ego with a fleet as without."""
@@ -302,6 +304,18 @@ class Recorder:
             rows.append(row)
         return as_table("plan", rows)
 
+    def _horizon_table(self) -> pd.DataFrame:
+        """Where every plan led."""
+        told = [(time, _planned(plan)) for time, _, plan in self._plans]
+        counts = [len(states) for _, states in told]
+        states = np.concatenate([np.empty((0, 4)), *[states for _, states in told]])
+        columns: dict[str, object] = {
+            "time": np.repeat([time for time, _ in told], counts),
+            "stage": np.concatenate([np.empty(0), *[1 + np.arange(n) for n in counts]]),
+            **dict(zip(("s", "d", "road_heading", "speed"), states.T, strict=True)),
+        }
+        return as_table("horizon", columns)
+
     def _on_exit(self, ego: FloatArray) -> BoolArray:
         """Tell when the ego, (n, 4) road states, is on an exit that has parted from its route.
 
@@ -341,3 +355,12 @@ class Recorder:
                 "sumo_ms": milliseconds[:, 3],
             },
         )
+
+
+def _planned(plan: Plan) -> FloatArray:
+    """Road states that a plan leads to, (n, 4); a user's planner need not say, or not so."""
+    try:
+        states = np.asarray(plan.states, dtype=float)
+    except (TypeError, ValueError):
+        states = np.empty(0)
+    return states[1:] if states.ndim == 2 and states.shape[1] == 4 else np.empty((0, 4))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 from pathlib import Path
 
@@ -155,12 +156,29 @@ def test_a_users_planner_drives() -> None:
     assert row["mean_speed"] == pytest.approx(25.0, abs=0.01)
 
 
+def test_where_plans_led_is_kept_and_a_users_planner_need_not_say() -> None:
+    rollout = run("stalled", "cohesive", 1, overrides={"duration": 3.0})
+    horizon = rollout.horizon.set_index(["time", "stage"])
+    assert len(horizon) == 10 * len(rollout.plan)
+    # What was driven first is where the ego is a step later.
+    ego = rollout.trajectory.query("vehicle == 'ego'").set_index("time")
+    first = horizon.xs(1, level="stage")
+    later = ego.iloc[1 : len(first) + 1][["s", "d", "speed"]].to_numpy()
+    assert first[["s", "d", "speed"]].to_numpy() == pytest.approx(later, abs=1e-6)
+    for planner in ("Straight", "Vague"):
+        name = f"tests.scenarios.test_stalled:{planner}"
+        assert run("stalled", name, 0, overrides={"duration": 1.0}).horizon.empty
+
+
 def test_a_planner_that_fails_is_braked_for_and_counted() -> None:
     rollout = run("stalled", "tests.scenarios.test_stalled:Broken", 0, overrides={"duration": 3.0})
     failed = rollout.plan[rollout.plan["fallback"]]
     assert len(failed) == rollout.metrics["plan_failures"].iloc[0] == 14
-    said = {"RuntimeError: out of ideas", "control is not finite, or not that of a car"}
-    assert set(failed["status"]) == said
+    line = inspect.getsourcelines(Broken.plan)[1] + 8
+    assert set(failed["status"]) == {
+        f"RuntimeError: out of ideas (test_stalled.py:{line})",
+        "control is not finite, or not that of a car",
+    }
     assert np.isfinite(rollout.trajectory.select_dtypes("number")).all().all()
 
 
@@ -195,6 +213,16 @@ def test_public_names_exist() -> None:
         assert getattr(sumo_cohesion, name) is not None
     with pytest.raises(AttributeError, match="nothing"):
         _ = sumo_cohesion.nothing  # type: ignore[attr-defined]
+
+
+class Vague(Straight):
+    """Says nonsense of where it leads."""
+
+    def plan(self, observation: object, history: object) -> object:
+        """Drive straight on all the same."""
+        from dataclasses import replace
+
+        return replace(super().plan(observation, history), states=[[1.0], "far"])  # type: ignore[type-var]
 
 
 class Dying(Straight):
