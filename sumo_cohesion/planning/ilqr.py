@@ -30,6 +30,7 @@ from sumo_cohesion.planning.settings import PlannerSettings
 from sumo_cohesion.planning.stage import (
     CONTROL_SCALE,
     N_STATES,
+    SCALES,
     TERMS,
     Stage,
     StageParameters,
@@ -120,7 +121,7 @@ class Ilqr:
         start = time.perf_counter()
         if instance is not self._bound:
             self._bind(instance)
-        np.divide(guess, CONTROL_SCALE, out=self._guess)
+        self._guess[:] = guess
         self._rollout[self._present]()
         cost = self._cost[0]
         if not isfinite(cost):
@@ -354,11 +355,12 @@ def _least_eigenvalue(h: Any) -> Any:
 
 
 def _rollout(stage: Stage, settings: PlannerSettings) -> Any:
-    """(start, u, p, low, high, most) -> (x, u within limits, cost, terms)."""
+    """(start, guess in SI units, p, low, high, most) -> (x, u within limits, cost, terms)."""
     start = ca.MX.sym("start", N_STATES)
-    _, u, p, *bounds = _trajectory(stage, settings.horizon)
+    _, guess, p, *bounds = _trajectory(stage, settings.horizon)
+    u = guess / ca.repmat(ca.DM(SCALES), 1, settings.horizon)
     driven = _driven(stage, settings, start, lambda i, _: u[:, i], [p, *bounds])
-    return ca.Function("rollout", [start, u, p, *bounds], driven)
+    return ca.Function("rollout", [start, guess, p, *bounds], driven)
 
 
 def _forward_pass(stage: Stage, settings: PlannerSettings) -> Any:
