@@ -201,7 +201,8 @@ def run_batch(
     else:
         _print_summary(_summary(rows))
     click.echo(f"metrics in {folder / 'metrics.parquet'}", err=True)
-    if len(left):
+    # Of all shards' runs one part is this command's: what has failed now.
+    if failed or (len(left) and shard == "1/1"):
         sys.exit(1)
 
 
@@ -369,6 +370,7 @@ def _warn_of_failures(plan: pd.DataFrame) -> None:
 
 def _print_summary(summary: pd.DataFrame) -> None:
     from rich.console import Console
+    from rich.markup import escape
     from rich.table import Table
 
     if summary.empty:
@@ -379,13 +381,13 @@ def _print_summary(summary: pd.DataFrame) -> None:
         down, across = across, down
         summary = summary[summary["metric"].isin(_IN_SHORT)]
     for name in (down, *summary[across].unique()):
-        table.add_column(name, justify="left" if name == down else "right", no_wrap=True)
+        table.add_column(escape(name), justify="left" if name == down else "right", no_wrap=True)
     for of in summary[down].unique():
         cells = [
             f"{r.value:.2f} [{r.low:.2f}, {r.high:.2f}] n={r.n}" if r.n else "-"
             for r in summary[summary[down] == of].itertuples()
         ]
-        table.add_row(of, *cells)
+        table.add_row(escape(of), *cells)
     # Wide enough for the table where the output is a file or a pipe.
     Console(width=None if sys.stdout.isatty() else 140).print(table)
 

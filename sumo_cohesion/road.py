@@ -56,7 +56,8 @@ class Road:
     s0 : arc length (m) of the first vertex; the route itself starts at s = 0.
     length : arc length (m) at which the route ends.
     lane_centre, lane_width : (G, L) lateral position and width (m) of each lane, NaN where the
-        lane does not exist. Lanes off the route that can be reached from it (exits) come last.
+        lane does not exist. Lanes off the route that can be reached from it (exits) come last; a
+        column may hold several that are far apart.
     speed_limit : (G,) limit (m/s).
     n_route_lanes : how many of the L lanes belong to the route.
     """
@@ -72,6 +73,7 @@ class Road:
     lane_width: FloatArray
     speed_limit: FloatArray
     n_route_lanes: int
+    _first: int = field(init=False, repr=False, compare=False)
     _tree: cKDTree = field(init=False, repr=False, compare=False)
     _segments: list[tuple[float, ...]] = field(init=False, repr=False, compare=False)
     _near: dict[tuple[int, int], int] = field(init=False, repr=False, compare=False)
@@ -91,7 +93,10 @@ class Road:
         rows = np.column_stack((vertices, tangents, heading))
         # One row per segment: values at its start, then their change along it, then curvature.
         segments = np.column_stack((rows[:-1], np.diff(rows, axis=0), self.curvature[:-1]))
-        object.__setattr__(self, "_tree", cKDTree(vertices))
+        # Of the route alone: an extension beyond its end may well cross it.
+        first, end = self.index(0.0), self.index(self.length)
+        object.__setattr__(self, "_first", int(first))
+        object.__setattr__(self, "_tree", cKDTree(vertices[first : end + 1]))
         object.__setattr__(self, "_segments", [tuple(row) for row in segments.tolist()])
         object.__setattr__(self, "_near", {})
         # No lane is infinitely far: NaN would win every argmin.
@@ -219,16 +224,20 @@ class Road:
         return None
 
     def returns(self, first: float, last: float) -> float | None:
-        """Where (s, m) between two places the road comes back to, or crosses, where it was before.
+        """Where (s, m) the road comes back to, or crosses, where it is between two places.
 
         Nearer than TOO_NEAR, so that a car beside it could be in either place. None if nowhere.
         """
-        i, j = (min(max(round((s - self.s0) / SPACING), 0), self.x.size - 1) for s in (first, last))
-        pairs = self._tree.query_pairs(TOO_NEAR, output_type="ndarray")
-        later = pairs[:, 1][(pairs[:, 0] >= i) & (pairs[:, 1] <= j)]
-        apart = (pairs[:, 1] - pairs[:, 0])[(pairs[:, 0] >= i) & (pairs[:, 1] <= j)]
-        met = later[apart * SPACING > 6.0 * TOO_NEAR]
-        return self.s0 + float(met.min()) * SPACING if met.size else None
+        pairs = self._first + self._tree.query_pairs(TOO_NEAR, output_type="ndarray")
+        pairs = self.s0 + SPACING * pairs
+        before, after = pairs.min(axis=1), pairs.max(axis=1)
+        met = after - before > 6.0 * TOO_NEAR
+        met &= ((first <= before) & (before <= last)) | ((first <= after) & (after <= last))
+        return float(after[met].min()) if met.any() else None
+
+    def away(self, x: float, y: float) -> float:
+        """Metres from a point to the nearest vertex of the route."""
+        return float(self._tree.query((x, y))[0])
 
     def project(self, x: float, y: float) -> tuple[float, float, float, float]:
         """Road coordinates of one Cartesian point.
@@ -246,9 +255,11 @@ class Road:
         if i < 0:
             if len(self._near) > 100_000:
                 self._near.clear()
-            centre = (10.0 * cell[0] + 5.0, 10.0 * cell[1] + 5.0)
-            i = self._near[cell] = min(int(self._tree.query(centre)[1]), len(self._segments) - 1)
+            i = self._near[cell] = self._start_of(cell)
         last = len(self._segments) - 1
+        if i == last + 1:  # of several stretches nearby the nearest to the point itself
+            i = min(self._first + int(self._tree.query((x, y))[1]), last)
+        came_from = -1
         for _ in range(20):
             x0, y0, tx0, ty0, h0, ex, ey, tx1, ty1, h1, curvature = self._segments[i]
             rx, ry = x - x0, y - y0
@@ -262,11 +273,25 @@ class Road:
                 u -= (c0 + u * (c1 + u * c2)) / (c1 + 2.0 * u * c2)
                 u -= (c0 + u * (c1 + u * c2)) / (c1 + 2.0 * u * c2)
             step = floor(u)
-            if step == 0 or not 0 <= i + step <= last:
+            # At a vertex of a sharp bend both segments may say that it is on the other one.
+            if step == 0 or not 0 <= i + step <= last or i + step == came_from:
                 break
-            i += step
+            came_from, i = i, i + step
         d = (tx0 + u * tx1) * (ry - u * ey) - (ty0 + u * ty1) * (rx - u * ex)
         return self.s0 + (i + u) * SPACING, d, h0 + u * h1, curvature
+
+    def _start_of(self, cell: tuple[int, int]) -> int:
+        """Segment from which to look for the foot of a 10 m cell's points.
+
+        The nearest to its centre; one more than there are if several stretches of the route could
+        be the nearest of one of its points.
+        """
+        last, centre = len(self._segments) - 1, (10.0 * cell[0] + 5.0, 10.0 * cell[1] + 5.0)
+        distance, nearest = self._tree.query(centre)
+        around = np.sort(self._tree.query_ball_point(centre, distance + 15.0))
+        if (np.diff(around) > 40.0 / SPACING).any():
+            return last + 1
+        return min(self._first + int(nearest), last)
 
     def to_frenet(self, states: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Cartesian to road frame.

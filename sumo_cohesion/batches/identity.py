@@ -89,9 +89,20 @@ def planner_digest(name: str) -> str:
         ]
     else:
         files = list(_imported(Path(spec.origin))) if spec.origin else []
-    named = [value for value in planner.arguments.values() if isinstance(value, str)]
-    files += [Path(value) for value in named if Path(value).is_file()]
+    files += _files_in(planner.arguments)
     return _digest(json.dumps(sorted([path.name, file_digest(path)] for path in files)).encode())
+
+
+def _files_in(value: object) -> list[Path]:
+    """Return the files that a literal, or what it holds, names."""
+    if isinstance(value, dict):
+        return [path for inner in value.values() for path in _files_in(inner)]
+    if isinstance(value, list | tuple | set):
+        return [path for inner in value for path in _files_in(inner)]
+    try:
+        return [Path(value)] if isinstance(value, str) and Path(value).is_file() else []
+    except (OSError, ValueError):  # no file can have such a name
+        return []
 
 
 def _imported(module: Path) -> set[Path]:

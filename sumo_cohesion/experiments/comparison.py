@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -126,9 +127,16 @@ def compare(
     return comparison
 
 
+_LONGEST = 150
+"""Characters of a folder's name."""
+
+
 def run_folder(folder: Path, planner: str, seed: int) -> Path:
     """Folder of one run within a comparison's folder."""
-    return folder / quote(planner.replace(":", ".", 1), safe="()=', ") / f"seed_{seed:04d}"
+    name = quote(planner.replace(":", ".", 1), safe="()=', ")
+    if len(name) > _LONGEST:
+        name = f"{name[:_LONGEST]}-{hashlib.sha256(name.encode()).hexdigest()[:8]}"
+    return folder / name / f"seed_{seed:04d}"
 
 
 def _keep(new: Path, folder: Path) -> Path | None:

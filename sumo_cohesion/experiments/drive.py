@@ -44,10 +44,12 @@ def ask(
 
 
 def _where(error: Exception) -> str:
-    """File and line of the planner's module in which an error was raised, or led to it."""
+    """File and line of the planner's module at which `plan` raised; empty if it returned."""
     frames = traceback.extract_tb(error.__traceback__)[1:]  # the first is ask()
+    if not frames or frames[0].name != "plan":
+        return ""
     own = [frame for frame in frames if frame.filename == frames[0].filename]
-    return f" ({Path(own[-1].filename).name}:{own[-1].lineno})" if own else ""
+    return f" ({Path(own[-1].filename).name}:{own[-1].lineno})"
 
 
 def _is_physical(control: Control) -> bool:

@@ -71,8 +71,8 @@ class Fleet:
     A car is taken in when it is equipped and comes into the ego's sensing range. It is handed
     back, by no longer being driven, when it is `HYSTERESIS` beyond that range, at the end of its
     route, or when it has touched another car; the last two are never taken in again. Never taken
-    in are cars that no road can be built for, and none as long as it has a stop to make: planners
-    know nothing of stops.
+    in are cars that no road can be built for, or driven along (check_road), and none as long as it
+    has a stop to make: planners know nothing of stops.
     """
 
     def __init__(self, setup: Setup) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import difflib
-import re
 import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -202,6 +201,11 @@ def _meant(name: str) -> str:
     """Suggest settings that are spelt like an unknown one, or all there is to set."""
     groups = {"planner": PlannerSettings.model_fields, "cohesion": CohesionSettings.model_fields}
     head, dot, tail = name.partition(".")
+    if head in groups:
+        return (
+            f"; it is a group: set one of {', '.join(f'{head}.{key}' for key in groups[head])}; "
+            "which planner drives is said by --planner, --planners or an experiment's planners"
+        )
     same = [f"{group}.{name}" for group, fields in groups.items() if name in fields]
     close = difflib.get_close_matches(head, [*groups, *Scenario.model_fields], 1)
     meant = same or [close[0] + dot + tail] if same or close else []
@@ -249,12 +253,23 @@ def parse_override(text: str) -> tuple[str, Any]:
 
 
 def split_planners(names: str) -> list[str]:
-    """Split names at commas, but not within parentheses.
+    """Split names at commas, but not within brackets or quotes.
 
-    >>> split_planners("nominal, my:Follow(gain=1, lag=2),sumo")
-    ['nominal', 'my:Follow(gain=1, lag=2)', 'sumo']
+    >>> split_planners("nominal, my:Follow(gain=(1, 2), name='a, ('),sumo")
+    ['nominal', "my:Follow(gain=(1, 2), name='a, (')", 'sumo']
     """
-    parts = re.split(r",(?![^()]*\))", names)
+    parts, depth, quote = [""], 0, ""
+    for character in names:
+        if quote:
+            quote = "" if character == quote else quote
+        elif character in "'\"":
+            quote = character
+        else:
+            depth += (character in "([{") - (character in ")]}")
+        if character == "," and not depth and not quote:
+            parts.append("")
+        else:
+            parts[-1] += character
     return [part.strip() for part in parts if part.strip()]
 
 

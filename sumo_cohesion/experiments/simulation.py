@@ -28,7 +28,7 @@ from sumo_cohesion.perception.observation import Sensor
 from sumo_cohesion.planning.planners import Planner, make_planner
 from sumo_cohesion.road import Road
 from sumo_cohesion.social.memory import new_history
-from sumo_cohesion.state import RoadState
+from sumo_cohesion.state import CartesianState, RoadState
 from sumo_cohesion.traffic.contact import contacts
 from sumo_cohesion.traffic.drivers import Drivers
 from sumo_cohesion.traffic.outputs import Output, SumoOutputs
@@ -128,7 +128,7 @@ def simulate(setup: Setup, planner: Planner, *, gui: bool = False) -> Rollout:
             scene = following
             touched = contacts(scene.ego, scene.ego_size, scene.states, scene.sizes)
             finished = scene.time > end - STEP_LENGTH / 2
-            outcome = _outcome(bool(touched.size), observation.ego, road, finished)
+            outcome = _outcome(bool(touched.size), observation.ego, scene.ego, road, finished)
         fleet.meet(scene, sumo)  # who touched whom in the last step
         names, told = [scene.ids[i] for i in touched], sumo.reported_contacts()
         return recorder.finish(
@@ -154,12 +154,14 @@ def _older_objects_left_alone() -> Iterator[None]:
         gc.unfreeze()
 
 
-def _outcome(touched: bool, ego: RoadState, road: Road, finished: bool) -> str:
+def _outcome(
+    touched: bool, ego: RoadState, there: CartesianState, road: Road, finished: bool
+) -> str:
     """Why the run ends here; empty if it goes on."""
     if touched:
         return "collision"
     aside = abs(ego.d - road.nearest_lane(ego.s, ego.d))
-    if _LOST < aside < inf:
+    if _LOST < aside < inf and road.away(there.x, there.y) > _LOST:
         return "left_route"
     if ego.s > road.length - END_OF_ROUTE:
         on_route = road.lane_of(ego.s, ego.d) < road.n_route_lanes

@@ -64,8 +64,7 @@ class Ilqr:
 
     def __init__(self, settings: PlannerSettings, n_lanes: int) -> None:
         self._settings = settings
-        self._parameters = StageParameters(settings, n_lanes)
-        stage = make_stage(settings, self._parameters)
+        stage = make_stage(settings, StageParameters(settings, n_lanes))
         functions, self.how = compiled(
             [
                 _backward_pass(stage, settings, exact=True),

@@ -277,8 +277,7 @@ def check_road(
     if s is not None:
         raise UserError(
             f"{s:.0f} m from its start the route comes back to where it was before (a U-turn, or a "
-            "bridge over itself), and which of both a car is at cannot be told; choose another "
-            "route, or a shorter duration"
+            "bridge over itself); a car there could be in either place; choose another route"
         )
     s = road.too_sharp(settings.max_curvature, first, last)
     if s is None or name == "sumo" or name not in BUILT_IN:
@@ -329,10 +328,12 @@ def parse_planner(name: str) -> OwnPlanner:
     module, class_name, arguments = found.groups()
     try:
         call = ast.parse(f"f{arguments or '()'}", mode="eval").body
-        if not isinstance(call, ast.Call) or call.args:
+        if not (isinstance(call, ast.Call) and isinstance(call.func, ast.Name)) or call.args:
             raise ValueError
-        given = {str(k.arg): ast.literal_eval(k.value) for k in call.keywords}
-    except (SyntaxError, ValueError):
+        given = {k.arg: ast.literal_eval(k.value) for k in call.keywords if k.arg}
+        if len(given) < len(call.keywords):
+            raise ValueError
+    except (SyntaxError, ValueError, TypeError, MemoryError, RecursionError):
         raise UserError(
             f"planner {name!r}: write its arguments by name and as Python literals, e.g. "
             f"{module}:{class_name}(gain=2.5, file='weights.txt')"

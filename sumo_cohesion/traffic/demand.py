@@ -118,7 +118,7 @@ def check_demand(
     if EGO in ids:
         raise UserError(f"a route file has a vehicle {EGO!r}; the scenario's [ego] adds it")
     for name in sorted(named):
-        if name in flows:
+        if name in flows and name not in ids:
             raise UserError(
                 f"the scenario names {name!r}, which is a flow; name its vehicles: "
                 f"{name}.0, {name}.1 and so on"

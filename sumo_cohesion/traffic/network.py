@@ -21,6 +21,8 @@ from sumo_cohesion.state import FloatArray, IntArray
 
 EXTENSION = 100.0
 """Straight metres added to both ends of the reference line, so that cars near them project."""
+_APART = round(100.0 / SPACING)
+"""Vertices between two exits in one column: farther than from one car to another in its lane."""
 SMOOTHING = 4.0
 """Standard deviation (m) of the filter that rounds the kinks of a polyline. It moves a curve of
 radius R inwards by SMOOTHING²/2R (2 cm at 400 m); the lanes, measured in the same frame, are
@@ -223,6 +225,11 @@ class Network:
                     limit[at] = np.fmax(limit[at], lane.getSpeed())
                     if lane.getEdge() == edges[-1]:
                         ends.append(at[-1])
+        if not ends:
+            raise UserError(
+                f"{self.path}: along the ego's route its own lanes cannot be found; it turns back "
+                "on itself; choose another destination"
+            )
         last = max(ends)
         first = round(-road.s0 / SPACING)
         for values in (centre[:, :n_route], width[:, :n_route], limit[:, None]):
@@ -310,10 +317,10 @@ def _extent(road: Road, lanes: list[Any]) -> tuple[int, int]:
 
 
 def _pack(extents: list[tuple[int, int]]) -> list[int]:
-    """Give each of some extents (first, last) a column, the first in which none is beside it.
+    """Give each of some extents (first, last) a column, the first in which none is near it.
 
-    >>> _pack([(0, 9), (5, 20), (11, 30), (12, 13)])
-    [0, 1, 0, 2]
+    >>> _pack([(0, 9), (5, 20), (150, 190), (160, 170)])
+    [0, 1, 0, 1]
     """
     columns: list[list[tuple[int, int]]] = []
     chosen = []
@@ -321,7 +328,7 @@ def _pack(extents: list[tuple[int, int]]) -> list[int]:
         free = (
             k
             for k, taken in enumerate(columns)
-            if all(last + 1 < a or b + 1 < first for a, b in taken)
+            if all(last + _APART < a or b + _APART < first for a, b in taken)
         )
         k = next(free, len(columns))
         if k == len(columns):

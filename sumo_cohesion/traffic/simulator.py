@@ -151,11 +151,13 @@ class Simulator:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        with contextlib.suppress(Exception):
-            self._take_up_moves()
-        with contextlib.suppress(Exception):
-            self._sumo.close()
-        _RUNNING.release()
+        try:
+            with contextlib.suppress(Exception):
+                self._take_up_moves()
+            with contextlib.suppress(Exception):
+                self._sumo.close()
+        finally:  # whatever interrupts it
+            _RUNNING.release()
 
     def _take_up_moves(self) -> None:
         """Step once more: a moveToXY not taken up crashes the next simulation in this process."""

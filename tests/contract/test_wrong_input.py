@@ -166,6 +166,7 @@ def test_broken_network_and_route_files(
         (["run", "stalled", "--set", "planner.solver=magic"], ["solver", "fatrop"]),
         (["run", "stalled", "--set", "beta"], ["name=value"]),
         (["run", "stalled", "--set", "beta=1"], ["did you mean 'cohesion.beta'"]),
+        (["run", "stalled", "--set", "planner=nominal"], ["planner.horizon", "--planner"]),
         (["run", "stalled", "--set", "egg.lane=1"], ["did you mean 'ego.lane'"]),
         (["run", "stalled", "--set", "weather=1"], ["planner.*", "cohesion.*", "duration"]),
         (["run", "stalled", "--sed", "1"], ["--sed"]),

@@ -334,6 +334,7 @@ def test_a_planners_arguments_and_the_files_they_name_decide_which_run_it_is(
     weights = tmp_path / "weights.txt"
 
     def keys(*arguments: str) -> list[str]:
+        arguments = (*arguments, "gain=['weights.txt']", f"gain='{'x' * 300}'")
         asked = [f"{FAULTY}Learned({given})" for given in arguments]
         experiment = {"scenarios": ["stalled"], "seeds": [0], "planners": asked}
         return list(spell_out(load_experiment(experiment)).plan["run"])
@@ -342,8 +343,8 @@ def test_a_planners_arguments_and_the_files_they_name_decide_which_run_it_is(
     first = keys("gain=0.5", "gain=1.0", "file='weights.txt'")
     weights.write_text("0.75")
     second = keys("gain=0.5", "gain=1.0", "file='weights.txt'")
-    assert first[:2] == second[:2]
-    assert len({*first, *second}) == 4
+    assert (first[:2], first[4]) == (second[:2], second[4])
+    assert len({*first, *second}) == 7  # the file's content counts, in a list, too
     experiment = {
         "scenarios": ["stalled"],
         "seeds": [0],

@@ -159,12 +159,30 @@ def test_where_a_road_comes_back_to_itself(highway: Road, curve: Road, city: Pat
     streets = Network(city)
     block = ("A0A1", "A1B1", "B1B0", "B0A0")
     around = streets.road(block)
-    assert around.returns(0.0, around.length - 20.0) is None
+    three = streets.road(block[:3])
+    assert three.returns(0.0, three.length) is None
     # Around the block and on along the first street: there again after four streets.
     again = streets.road((*block, "A0A1"))
-    where = again.returns(0.0, again.length)
-    assert where == pytest.approx(around.length, abs=15.0)
-    assert again.returns(0.0, 400.0) is None
+    for first, last in ((0.0, again.length), (20.0, 40.0), (again.length - 50.0, again.length)):
+        where = again.returns(first, last)
+        assert where is not None
+        assert around.length - 15.0 < where
+    assert again.returns(around.length / 2, around.length / 2 + 20.0) is None
+
+
+def test_a_point_is_projected_on_the_stretch_that_it_is_beside(city: Path) -> None:
+    """Also where another stretch passes nearby, or an extension of the line beyond its end."""
+    streets = Network(city)
+    for route in (
+        ("A0A1", "A1B1", "B1B0", "B0A0"),  # ends beside where it starts
+        ("B0B1", "B1C1", "C1C0", "C0B0", "B0A0"),  # crosses its own start's extension
+    ):
+        road = streets.road(route)
+        s = np.arange(20.0, road.length - 20.0, 1.0)
+        d = np.linspace(-1.0, 1.0, len(s))
+        there = road.to_cartesian(np.column_stack((s, d, np.zeros((len(s), 2)))))
+        back, _ = road.to_frenet(there)
+        assert np.abs(back[:, 0] - s).max() < 0.01
 
 
 def test_routes_that_do_not_exist_say_so() -> None:
