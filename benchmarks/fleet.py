@@ -32,7 +32,7 @@ from sumo_cohesion.experiments.simulation import simulate
 from sumo_cohesion.perception.observation import Overview
 from sumo_cohesion.planning.compiled import BoundCall, compiled
 from sumo_cohesion.planning.ilqr import _backward_pass
-from sumo_cohesion.planning.planners import make_planner
+from sumo_cohesion.planning.names import make_planner
 from sumo_cohesion.planning.settings import PlannerSettings
 from sumo_cohesion.planning.stage import StageParameters, make_stage
 

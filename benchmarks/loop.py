@@ -23,7 +23,7 @@ from benchmarks.rooms import SCENARIO, write_highway
 from sumo_cohesion.experiments.rollout import Rollout, versions
 from sumo_cohesion.experiments.setup import prepare
 from sumo_cohesion.experiments.simulation import simulate
-from sumo_cohesion.planning.planners import make_planner
+from sumo_cohesion.planning.names import make_planner
 from sumo_cohesion.traffic.library import load_libsumo
 
 HUMANS, EGO_PLACE = 50, 25

@@ -40,8 +40,8 @@ from sumo_cohesion.experiments.setup import prepare
 from sumo_cohesion.experiments.simulation import simulate
 from sumo_cohesion.planning import mpc as mpc_module
 from sumo_cohesion.planning.mpc import Mpc, shifted
+from sumo_cohesion.planning.names import make_planner
 from sumo_cohesion.planning.nlp import roll_out
-from sumo_cohesion.planning.planners import make_planner
 from sumo_cohesion.planning.problem import Instance, Problem, Solution
 from sumo_cohesion.planning.settings import PlannerSettings
 from sumo_cohesion.planning.stage import (

@@ -21,7 +21,7 @@ import pandas as pd
 from sumo_cohesion.experiments.rollout import versions
 from sumo_cohesion.experiments.setup import prepare
 from sumo_cohesion.experiments.simulation import simulate
-from sumo_cohesion.planning.planners import make_planner
+from sumo_cohesion.planning.names import make_planner
 from sumo_cohesion.traffic.simulator import Simulator
 
 SCENARIO = """

@@ -26,7 +26,7 @@ from sumo_cohesion.batches.identity import point_digest, run_key
 from sumo_cohesion.errors import UserError
 from sumo_cohesion.experiments.scenario import parse_seeds, read_toml, validated
 from sumo_cohesion.experiments.setup import resolve
-from sumo_cohesion.planning.planners import check_planner
+from sumo_cohesion.planning.names import check_planner
 from sumo_cohesion.traffic.outputs import Output
 
 Kept = Literal["ego", "trajectory", "plan", "horizon", "agreement", "timing", "reference"]

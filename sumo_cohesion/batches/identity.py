@@ -13,7 +13,7 @@ from pathlib import Path
 import sumo_cohesion
 from sumo_cohesion.experiments.rollout import versions
 from sumo_cohesion.experiments.setup import Inputs
-from sumo_cohesion.planning.planners import BUILT_IN, WITHOUT_COHESION, parse_planner
+from sumo_cohesion.planning.names import BUILT_IN, WITHOUT_COHESION, parse_planner
 
 _ROOMS = ("traffic", "perception", "social", "planning", "experiments")
 """The package's rooms whose code decides results, beside the shared modules."""

@@ -14,7 +14,7 @@ from sumo_cohesion.errors import InputsChangedError, StorageError
 from sumo_cohesion.experiments.rollout import Rollout
 from sumo_cohesion.experiments.setup import prepare
 from sumo_cohesion.experiments.simulation import simulate_with_outputs
-from sumo_cohesion.planning.planners import make_planner
+from sumo_cohesion.planning.names import make_planner
 from sumo_cohesion.traffic.demand import EGO
 from sumo_cohesion.traffic.outputs import Output
 

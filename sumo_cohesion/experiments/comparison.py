@@ -21,7 +21,7 @@ from sumo_cohesion.experiments.setup import prepare
 from sumo_cohesion.experiments.simulation import simulate
 from sumo_cohesion.experiments.statistics import summarize
 from sumo_cohesion.experiments.workers import NO_LIMITS, CallFailedError, Workers, processors
-from sumo_cohesion.planning.planners import make_planner
+from sumo_cohesion.planning.names import make_planner
 from sumo_cohesion.traffic.demand import EGO
 
 COMPARISON_FILE = "comparison.json"

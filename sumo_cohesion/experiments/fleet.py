@@ -18,7 +18,8 @@ import numpy as np
 from sumo_cohesion.experiments.drive import END_OF_ROUTE, ask, drive
 from sumo_cohesion.perception.history import History
 from sumo_cohesion.perception.observation import Overview
-from sumo_cohesion.planning.planners import Planner, check_road, make_planner
+from sumo_cohesion.planning.names import check_road, make_planner
+from sumo_cohesion.planning.planners import Planner
 from sumo_cohesion.road import Road
 from sumo_cohesion.social.memory import SharedFeatures, new_history
 from sumo_cohesion.state import CartesianState, FloatArray, Scene

@@ -18,7 +18,8 @@ import numpy as np
 from sumo_cohesion.perception.history import History
 from sumo_cohesion.perception.observation import Sensor
 from sumo_cohesion.planning import dynamics
-from sumo_cohesion.planning.planners import CohesivePlanner, cohesion_of
+from sumo_cohesion.planning.names import cohesion_of
+from sumo_cohesion.planning.planners import CohesivePlanner
 from sumo_cohesion.state import CartesianState, Observation, Plan, Scene
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ from typing import Any
 
 from sumo_cohesion.errors import UserError
 from sumo_cohesion.experiments.scenario import Scenario, load_scenario, settings_from
-from sumo_cohesion.planning.planners import check_planner, check_road, cohesion_of
+from sumo_cohesion.planning.names import check_planner, check_road, cohesion_of
 from sumo_cohesion.planning.settings import PlannerSettings
 from sumo_cohesion.road import Road
 from sumo_cohesion.social.settings import CohesionSettings

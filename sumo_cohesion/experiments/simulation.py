@@ -25,7 +25,8 @@ from sumo_cohesion.experiments.rollout import (
 )
 from sumo_cohesion.experiments.setup import Setup, prepare
 from sumo_cohesion.perception.observation import Sensor
-from sumo_cohesion.planning.planners import Planner, make_planner
+from sumo_cohesion.planning.names import make_planner
+from sumo_cohesion.planning.planners import Planner
 from sumo_cohesion.road import Road
 from sumo_cohesion.social.memory import new_history
 from sumo_cohesion.state import CartesianState, RoadState

@@ -7,7 +7,7 @@ import pytest
 
 from sumo_cohesion import run
 from sumo_cohesion.experiments.scenario import scenario_files
-from sumo_cohesion.planning.planners import BUILT_IN
+from sumo_cohesion.planning.names import BUILT_IN
 
 
 @pytest.mark.parametrize("planner", BUILT_IN)
