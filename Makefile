@@ -40,7 +40,7 @@ networks: $(VENV)/.installed
 	  sed -i '/^<!--/,/^-->/d' curve.net.xml
 
 docs: $(VENV)/.installed
-	$(BIN)/python -c "from sumo_cohesion.experiments.columns import describe_tables as d; print(d(), end='')" > docs/tables.md
+	$(BIN)/python -c "from sumo_cohesion.tables.columns import describe_tables as d; print(d(), end='')" > docs/tables.md
 	$(BIN)/sumo-cohesion compare stalled_swerve --seeds 0:1 --out results/readme
 	cp results/readme/paths.png docs/stalled_swerve.png
 

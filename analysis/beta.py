@@ -13,8 +13,8 @@ import json
 from pathlib import Path
 
 import sumo_cohesion as sc
-from sumo_cohesion.experiments.rollout import versions
 from sumo_cohesion.report.grid import draw_grid
+from sumo_cohesion.versions import versions
 
 ROOT = Path(__file__).resolve().parent.parent
 EXPERIMENT = ROOT / "docs" / "examples" / "beta.toml"

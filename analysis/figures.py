@@ -15,11 +15,11 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from sumo_cohesion import Rollout, run
-from sumo_cohesion.experiments.setup import prepare
 from sumo_cohesion.planning.landscape import reward_landscape
 from sumo_cohesion.report import paper
 from sumo_cohesion.report.drawing import save
 from sumo_cohesion.road import Road
+from sumo_cohesion.simulation.setup import prepare
 from sumo_cohesion.state import FloatArray, Observation, RoadState
 
 HERE = Path(__file__).resolve().parent

@@ -25,10 +25,10 @@ import pandas as pd
 from sumo_cohesion.batches.batch import Progress, batch
 from sumo_cohesion.batches.results import with_nominal_deviation
 from sumo_cohesion.errors import SimulationError, UserError
-from sumo_cohesion.experiments.columns import METRICS, as_table
-from sumo_cohesion.experiments.rollout import versions
-from sumo_cohesion.experiments.scenario import parse_seeds
-from sumo_cohesion.experiments.statistics import wilson
+from sumo_cohesion.tables.columns import METRICS, as_table
+from sumo_cohesion.tables.intervals import wilson
+from sumo_cohesion.user_input import parse_seeds
+from sumo_cohesion.versions import versions
 
 HERE = Path(__file__).resolve().parent
 PLANNERS = ("nominal", "cohesive", "paper", "sumo")

@@ -16,8 +16,8 @@ import pandas as pd
 
 from analysis.reproduce import HERE, Case, run_cases
 from sumo_cohesion.errors import SimulationError, UserError
-from sumo_cohesion.experiments.rollout import versions
-from sumo_cohesion.experiments.scenario import parse_seeds
+from sumo_cohesion.user_input import parse_seeds
+from sumo_cohesion.versions import versions
 
 Changes = Mapping[str, Mapping[str, Any]]
 _SEPARATOR = ", "

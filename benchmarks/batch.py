@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 import sumo_cohesion as sc
 from benchmarks.rooms import write_long_highway
 from sumo_cohesion.batches.batch import Progress
-from sumo_cohesion.experiments.rollout import versions
+from sumo_cohesion.versions import versions
 
 RUNS = 24
 

@@ -24,17 +24,18 @@ import pandas as pd
 import pytest
 
 from benchmarks.rooms import write_highway
-from sumo_cohesion.experiments import fleet as fleet_module
-from sumo_cohesion.experiments.fleet import Fleet
-from sumo_cohesion.experiments.rollout import Rollout, versions
-from sumo_cohesion.experiments.setup import prepare
-from sumo_cohesion.experiments.simulation import simulate
 from sumo_cohesion.perception.observation import Overview
-from sumo_cohesion.planning.compiled import BoundCall, compiled
-from sumo_cohesion.planning.ilqr import _backward_pass
-from sumo_cohesion.planning.names import make_planner
+from sumo_cohesion.planning.registry import make_planner
 from sumo_cohesion.planning.settings import PlannerSettings
+from sumo_cohesion.planning.solvers.compiled import BoundCall, compiled
+from sumo_cohesion.planning.solvers.ilqr import _backward_pass
 from sumo_cohesion.planning.stage import StageParameters, make_stage
+from sumo_cohesion.simulation import fleet as fleet_module
+from sumo_cohesion.simulation.fleet import Fleet
+from sumo_cohesion.simulation.run import simulate
+from sumo_cohesion.simulation.setup import prepare
+from sumo_cohesion.tables.rollout import Rollout
+from sumo_cohesion.versions import versions
 
 LANES, SPACING, AT_LEAST = 5, 16.0, 100
 SCENARIO = """

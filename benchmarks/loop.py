@@ -20,11 +20,12 @@ from typing import Any
 import pandas as pd
 
 from benchmarks.rooms import SCENARIO, write_highway
-from sumo_cohesion.experiments.rollout import Rollout, versions
-from sumo_cohesion.experiments.setup import prepare
-from sumo_cohesion.experiments.simulation import simulate
-from sumo_cohesion.planning.names import make_planner
+from sumo_cohesion.planning.registry import make_planner
+from sumo_cohesion.simulation.run import simulate
+from sumo_cohesion.simulation.setup import prepare
+from sumo_cohesion.tables.rollout import Rollout
 from sumo_cohesion.traffic.library import load_libsumo
+from sumo_cohesion.versions import versions
 
 HUMANS, EGO_PLACE = 50, 25
 PLANNERS = ("sumo", "cohesive")

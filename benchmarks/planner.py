@@ -35,15 +35,13 @@ import casadi as ca
 import numpy as np
 import pandas as pd
 
-from sumo_cohesion.experiments.rollout import versions
-from sumo_cohesion.experiments.setup import prepare
-from sumo_cohesion.experiments.simulation import simulate
 from sumo_cohesion.planning import mpc as mpc_module
-from sumo_cohesion.planning.mpc import Mpc, shifted
-from sumo_cohesion.planning.names import make_planner
-from sumo_cohesion.planning.nlp import roll_out
 from sumo_cohesion.planning.problem import Instance, Problem, Solution
+from sumo_cohesion.planning.registry import make_planner
 from sumo_cohesion.planning.settings import PlannerSettings
+from sumo_cohesion.planning.solvers.mpc import Mpc, shifted
+from sumo_cohesion.planning.solvers.nlp import roll_out
+from sumo_cohesion.planning.solvers.transcription import Transcription
 from sumo_cohesion.planning.stage import (
     CONTROL_SCALE,
     N_STATES,
@@ -52,7 +50,9 @@ from sumo_cohesion.planning.stage import (
     make_stage,
     rate_excess,
 )
-from sumo_cohesion.planning.transcription import Transcription
+from sumo_cohesion.simulation.run import simulate
+from sumo_cohesion.simulation.setup import prepare
+from sumo_cohesion.versions import versions
 
 OURS = "ours, compiled"
 REPEATS = 3

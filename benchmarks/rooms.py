@@ -18,11 +18,11 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from sumo_cohesion.experiments.rollout import versions
-from sumo_cohesion.experiments.setup import prepare
-from sumo_cohesion.experiments.simulation import simulate
-from sumo_cohesion.planning.names import make_planner
+from sumo_cohesion.planning.registry import make_planner
+from sumo_cohesion.simulation.run import simulate
+from sumo_cohesion.simulation.setup import prepare
 from sumo_cohesion.traffic.simulator import Simulator
+from sumo_cohesion.versions import versions
 
 SCENARIO = """
 name = "stream"

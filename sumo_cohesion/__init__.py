@@ -10,28 +10,28 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from sumo_cohesion.batches.batch import batch
-    from sumo_cohesion.batches.paired import compare_planners
+    from sumo_cohesion.batches.comparison import Comparison, compare
     from sumo_cohesion.batches.results import load_metrics, load_trajectories
     from sumo_cohesion.errors import SimulationError, UserError
-    from sumo_cohesion.experiments.comparison import Comparison, compare
-    from sumo_cohesion.experiments.export import export_scenario
-    from sumo_cohesion.experiments.rollout import Rollout
-    from sumo_cohesion.experiments.scenario import load_scenario
-    from sumo_cohesion.experiments.simulation import run
+    from sumo_cohesion.simulation.export import export_scenario
+    from sumo_cohesion.simulation.run import run
+    from sumo_cohesion.simulation.scenario import load_scenario
+    from sumo_cohesion.tables.paired import compare_planners
+    from sumo_cohesion.tables.rollout import Rollout
 
 _HOME = {
-    "Comparison": "experiments.comparison",
-    "Rollout": "experiments.rollout",
+    "Comparison": "batches.comparison",
+    "Rollout": "tables.rollout",
     "SimulationError": "errors",
     "UserError": "errors",
     "batch": "batches.batch",
-    "compare": "experiments.comparison",
-    "compare_planners": "batches.paired",
-    "export_scenario": "experiments.export",
+    "compare": "batches.comparison",
+    "compare_planners": "tables.paired",
+    "export_scenario": "simulation.export",
     "load_metrics": "batches.results",
-    "load_scenario": "experiments.scenario",
+    "load_scenario": "simulation.scenario",
     "load_trajectories": "batches.results",
-    "run": "experiments.simulation",
+    "run": "simulation.run",
 }
 
 __all__ = [

@@ -42,7 +42,7 @@ def app() -> None:
 @app.command()
 def scenarios() -> None:
     """List the bundled scenarios, one line each."""
-    from sumo_cohesion.experiments.scenario import load_scenario, scenario_files
+    from sumo_cohesion.simulation.scenario import load_scenario, scenario_files
 
     for path in scenario_files():
         click.echo(f"{path.stem:20} {load_scenario(path.stem).summary}")
@@ -66,7 +66,7 @@ def run(
     as_json: bool,
 ) -> None:
     """Drive SCENARIO (a bundled name or a TOML file) once."""
-    from sumo_cohesion.experiments.simulation import run as run_once
+    from sumo_cohesion.simulation.run import run as run_once
 
     with _clean_stdout():
         rollout = run_once(scenario, planner, seed, overrides=_overrides(changes), out=out, gui=gui)
@@ -106,9 +106,9 @@ def compare(
     as_json: bool,
 ) -> None:
     """Run several planners on the same seeds of SCENARIO and compare them."""
-    from sumo_cohesion.experiments.comparison import compare as compare_planners
-    from sumo_cohesion.experiments.scenario import parse_seeds, split_planners
+    from sumo_cohesion.batches.comparison import compare as compare_planners
     from sumo_cohesion.report.paths import draw_comparison
+    from sumo_cohesion.user_input import parse_seeds, split_planners
 
     folder = out if out is not None else Path("results") / Path(scenario).stem
     names, numbers = split_planners(planners), parse_seeds(seeds)
@@ -166,7 +166,7 @@ def run_batch(
     Interrupt it when you like, and run it again to go on. Exit status 1 if a run has no result.
     """
     from sumo_cohesion.batches import batch as batches
-    from sumo_cohesion.experiments.workers import processors
+    from sumo_cohesion.batches.workers import processors
 
     folder = out if out is not None else Path("results") / experiment.stem
     if dry_run:
@@ -216,7 +216,7 @@ def _parse_shard(text: str) -> tuple[int, int]:
 
 def _summary(rows: pd.DataFrame) -> pd.DataFrame:
     """Rates and means of every point of the grid: scenario, planner and parameters."""
-    from sumo_cohesion.experiments.statistics import summarize
+    from sumo_cohesion.tables.intervals import summarize
 
     done, columns = rows[rows["status"] == "done"], list(rows.columns)
     grid = columns[columns.index("planner") + 1 : columns.index("seed")]
@@ -330,13 +330,13 @@ def scenario() -> None:
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder to write.")
 def export(name: str, seed: int, changes: tuple[str, ...], out: Path) -> None:
     """Write SCENARIO for plain SUMO: sumo-gui -c OUT/scenario.sumocfg."""
-    from sumo_cohesion.experiments.export import export_scenario
+    from sumo_cohesion.simulation.export import export_scenario
 
     click.echo(export_scenario(name, out, seed=seed, overrides=_overrides(changes)))
 
 
 def _overrides(changes: Sequence[str]) -> dict[str, Any]:
-    from sumo_cohesion.experiments.scenario import parse_override
+    from sumo_cohesion.user_input import parse_override
 
     return dict(parse_override(text) for text in changes)
 

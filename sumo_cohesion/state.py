@@ -16,6 +16,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+STEP = 0.1
+"""Seconds per step, of SUMO and of every planner."""
+EGO = "ego"
+"""Id of the ego vehicle, in SUMO and in all tables."""
+
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 BoolArray = NDArray[np.bool_]

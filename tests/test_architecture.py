@@ -17,17 +17,21 @@ ALLOWED = {
     "errors": set(),
     "locks": set(),
     "state": set(),
+    "versions": set(),
+    "user_input": {"errors"},
     "road": {"state"},
-    "traffic": SHARED,
+    "traffic": SHARED | {"user_input"},
     "perception": SHARED,
     "social": SHARED | {"perception"},
     "planning": SHARED | {"perception", "social"},
-    "experiments": SHARED | {"traffic", "perception", "social", "planning"},
-    "batches": SHARED | {"traffic", "social", "planning", "experiments"},
-    "report": SHARED | {"experiments", "batches"},
-    "cli": {"errors", "experiments", "batches", "report"},
+    "tables": {"errors", "state"},
+    "simulation": SHARED
+    | {"traffic", "perception", "social", "planning", "tables", "user_input", "versions"},
+    "batches": SHARED | {"traffic", "planning", "simulation", "tables", "user_input", "versions"},
+    "report": SHARED | {"tables", "batches"},
+    "cli": {"errors", "simulation", "tables", "batches", "report", "user_input"},
     "__main__": {"cli"},
-    "__init__": {"errors", "experiments", "batches"},
+    "__init__": {"errors", "simulation", "tables", "batches"},
 }
 OUTSIDE = {
     "libsumo": {"traffic"},
@@ -63,11 +67,9 @@ def test_imports_go_one_way(path: Path) -> None:
 
 
 def test_metrics_and_statistics_see_tables_only() -> None:
-    for name in ("metrics", "statistics", "columns"):
-        inside = {
-            n for n in imports(PACKAGE / "experiments" / f"{name}.py") if "sumo_cohesion" in n
-        }
-        assert inside <= {"sumo_cohesion.experiments.columns", "sumo_cohesion.state"}
+    for name in ("metrics", "intervals", "columns"):
+        inside = {n for n in imports(PACKAGE / "tables" / f"{name}.py") if "sumo_cohesion" in n}
+        assert inside <= {"sumo_cohesion.tables.columns", "sumo_cohesion.state"}
 
 
 def test_importing_the_package_loads_neither_sumo_nor_casadi() -> None:
@@ -81,7 +83,7 @@ def test_importing_the_package_loads_neither_sumo_nor_casadi() -> None:
 
 
 def test_the_loop_fits_a_screen() -> None:
-    tree = ast.parse((PACKAGE / "experiments" / "simulation.py").read_text(encoding="utf-8"))
+    tree = ast.parse((PACKAGE / "simulation" / "run.py").read_text(encoding="utf-8"))
     (loop,) = [n for n in tree.body if isinstance(n, ast.FunctionDef) and n.name == "simulate"]
     assert loop.end_lineno is not None
     assert loop.end_lineno - loop.lineno + 1 <= 40

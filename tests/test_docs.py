@@ -13,8 +13,8 @@ import pytest
 from analysis import markdown
 from sumo_cohesion import cli
 from sumo_cohesion.batches.experiment import Experiment, RunLimits, load_experiment, spell_out
-from sumo_cohesion.experiments.columns import describe_tables
-from sumo_cohesion.experiments.scenario import Scenario
+from sumo_cohesion.simulation.scenario import Scenario
+from sumo_cohesion.tables.columns import describe_tables
 from tests.conftest import ROOT
 
 README = (ROOT / "README.md").read_text(encoding="utf-8")

@@ -15,15 +15,7 @@ import pandas as pd
 from sumo_cohesion.batches.experiment import Experiment, Work, load_experiment, spell_out
 from sumo_cohesion.batches.job import SUMO, TASK, Job
 from sumo_cohesion.batches.store import CHANGED, DONE, Store, joined
-from sumo_cohesion.errors import (
-    InputsChangedError,
-    SimulationError,
-    StorageError,
-    UserError,
-)
-from sumo_cohesion.experiments.rollout import versions
-from sumo_cohesion.experiments.setup import prepare
-from sumo_cohesion.experiments.workers import (
+from sumo_cohesion.batches.workers import (
     CallFailedError,
     Limits,
     Workers,
@@ -32,6 +24,14 @@ from sumo_cohesion.experiments.workers import (
     search_paths,
     stopped_by_signals,
 )
+from sumo_cohesion.errors import (
+    InputsChangedError,
+    SimulationError,
+    StorageError,
+    UserError,
+)
+from sumo_cohesion.simulation.setup import prepare
+from sumo_cohesion.versions import versions
 
 _WORTH_RETRYING = ("crash", "timeout", "memory")
 

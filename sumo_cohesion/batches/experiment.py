@@ -24,10 +24,10 @@ from pydantic import (
 
 from sumo_cohesion.batches.identity import point_digest, run_key
 from sumo_cohesion.errors import UserError
-from sumo_cohesion.experiments.scenario import parse_seeds, read_toml, validated
-from sumo_cohesion.experiments.setup import resolve
-from sumo_cohesion.planning.names import check_planner
+from sumo_cohesion.planning.registry import check_planner
+from sumo_cohesion.simulation.setup import resolve
 from sumo_cohesion.traffic.outputs import Output
+from sumo_cohesion.user_input import parse_seeds, read_toml, validated
 
 Kept = Literal["ego", "trajectory", "plan", "horizon", "agreement", "timing", "reference"]
 """Tables that can be kept per run; ``ego`` is the ego's part of the trajectory."""

@@ -11,11 +11,19 @@ from functools import lru_cache
 from pathlib import Path
 
 import sumo_cohesion
-from sumo_cohesion.experiments.rollout import versions
-from sumo_cohesion.experiments.setup import Inputs
-from sumo_cohesion.planning.names import BUILT_IN, WITHOUT_COHESION, parse_planner
+from sumo_cohesion.planning.registry import BUILT_IN, WITHOUT_COHESION, parse_planner
+from sumo_cohesion.simulation.setup import Inputs
+from sumo_cohesion.versions import versions
 
-_ROOMS = ("traffic", "perception", "social", "planning", "experiments")
+_ROOMS = (
+    "traffic",
+    "perception",
+    "social",
+    "planning",
+    "planning/solvers",
+    "simulation",
+    "tables",
+)
 """The package's rooms whose code decides results, beside the shared modules."""
 
 

@@ -11,11 +11,11 @@ import pandas as pd
 
 from sumo_cohesion.batches.identity import point_digest, run_key
 from sumo_cohesion.errors import InputsChangedError, StorageError
-from sumo_cohesion.experiments.rollout import Rollout
-from sumo_cohesion.experiments.setup import prepare
-from sumo_cohesion.experiments.simulation import simulate_with_outputs
-from sumo_cohesion.planning.names import make_planner
-from sumo_cohesion.traffic.demand import EGO
+from sumo_cohesion.planning.registry import make_planner
+from sumo_cohesion.simulation.run import simulate_with_outputs
+from sumo_cohesion.simulation.setup import prepare
+from sumo_cohesion.state import EGO
+from sumo_cohesion.tables.rollout import Rollout
 from sumo_cohesion.traffic.outputs import Output
 
 TASK = f"{__name__}:drive"

@@ -13,8 +13,8 @@ from sumo_cohesion.batches.experiment import as_cell
 from sumo_cohesion.batches.job import table_file
 from sumo_cohesion.batches.store import is_batch, joined, read_parquet, wanted
 from sumo_cohesion.errors import UserError
-from sumo_cohesion.experiments.metrics import deviation
-from sumo_cohesion.experiments.rollout import RUN_FILE
+from sumo_cohesion.tables.metrics import deviation
+from sumo_cohesion.tables.rollout import RUN_FILE
 
 _OF_NOMINAL = ("nominal_lateral_deviation", "nominal_speed_deviation")
 

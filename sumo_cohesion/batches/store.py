@@ -27,8 +27,8 @@ import pandas as pd
 
 from sumo_cohesion.batches.job import table_file
 from sumo_cohesion.errors import StorageError, UserError
-from sumo_cohesion.experiments.columns import BATCH, METRICS
 from sumo_cohesion.locks import alone
+from sumo_cohesion.tables.columns import BATCH, METRICS
 
 MANIFEST = "manifest.json"
 FORMAT = 1

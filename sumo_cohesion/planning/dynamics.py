@@ -7,9 +7,6 @@ from typing import Any
 
 import numpy as np
 
-DT = 0.1
-"""Seconds per planned step, as long as SUMO's."""
-
 
 def step(
     state: Any, control: Any, dt: float, friction: float, road_curvature: Any = 0.0

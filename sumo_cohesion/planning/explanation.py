@@ -8,11 +8,10 @@ from itertools import chain
 from math import cos, sin
 from typing import Any, overload
 
-from sumo_cohesion.planning.dynamics import DT
 from sumo_cohesion.social.agreement import Agreement
 from sumo_cohesion.social.features import FEATURES, social_features
 from sumo_cohesion.social.place import SCALE, Place
-from sumo_cohesion.state import AgreementRow, RoadState
+from sumo_cohesion.state import STEP, AgreementRow, RoadState
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,8 +35,8 @@ class Explanation(Sequence[AgreementRow]):
         """Say what was agreed and what ignoring it would cost: by field of AgreementRow."""
         s, d, heading, speed = self.ego
         on = (
-            s + DT * speed * cos(heading) / (1.0 - self.bend * d),
-            d + DT * speed * sin(heading),
+            s + STEP * speed * cos(heading) / (1.0 - self.bend * d),
+            d + STEP * speed * sin(heading),
             heading,
             speed,
         )
@@ -48,7 +47,7 @@ class Explanation(Sequence[AgreementRow]):
             list(chain.from_iterable(values))
             for values in zip(*[(g.mean, g.variance, g.weight) for g in groups], strict=True)
         )
-        own = [*social_features(self.ego, on, DT, self.bend)] * len(groups)
+        own = [*social_features(self.ego, on, STEP, self.bend)] * len(groups)
         names = [*FEATURES] * len(groups)
         place = self.place
         if any(place.weight):

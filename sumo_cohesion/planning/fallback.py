@@ -6,10 +6,9 @@ from math import isfinite
 
 import numpy as np
 
-from sumo_cohesion.planning.dynamics import DT
 from sumo_cohesion.planning.settings import PlannerSettings
 from sumo_cohesion.road import Road
-from sumo_cohesion.state import Control, Observation, Plan
+from sumo_cohesion.state import STEP, Control, Observation, Plan
 
 BRAKING = 4.0
 """m/s², braking of the fallback plan."""
@@ -19,7 +18,7 @@ def fallback(observation: Observation, road: Road, settings: PlannerSettings, st
     """Plan without a solver: brake in the lane the ego is in."""
     ego = observation.ego
     curvature = keep_lane(observation, road, settings)
-    braking = min(BRAKING, ego.speed / DT)
+    braking = min(BRAKING, ego.speed / STEP)
     control = Control(curvature, settings.friction * ego.speed - braking)
     return Plan(controls=(control,), states=np.array([ego]), status=status, fallback=True)
 

@@ -14,10 +14,9 @@ from math import cos, sin
 import numpy as np
 
 from sumo_cohesion.planning import dynamics
-from sumo_cohesion.planning.dynamics import DT
 from sumo_cohesion.planning.settings import PlannerSettings
 from sumo_cohesion.road import Road
-from sumo_cohesion.state import Control, Observation, Plan
+from sumo_cohesion.state import STEP, Control, Observation, Plan
 
 HARDEST_BRAKING = 8.0
 """m/s² that a car ahead may brake with."""
@@ -43,35 +42,35 @@ def checked(plan: Plan, observation: Observation, road: Road, settings: PlannerS
         return plan
     control, ego = plan.controls[0], observation.ego
     bend = road.bend_at(ego.s)
-    after = dynamics.step(ego, control, DT, settings.friction, bend)
+    after = dynamics.step(ego, control, STEP, settings.friction, bend)
     # The curvature with which the ego goes parallel to the road after one step.
     level = bend * cos(ego.heading) / (1.0 - bend * ego.d)
-    level -= ego.heading / (DT * max(after[3], 1.0))
+    level -= ego.heading / (STEP * max(after[3], 1.0))
     sharpest = settings.sharpest(max(ego.speed, after[3]))
     level = min(max(level, -sharpest), sharpest)
-    hardest = settings.friction * ego.speed - min(settings.max_braking, ego.speed / DT)
+    hardest = settings.friction * ego.speed - min(settings.max_braking, ego.speed / STEP)
     curvature, acceleration, reasons = control.curvature, control.acceleration, []
     own = _extent(ego.heading, observation.ego_size)
     reach = safe_distance(after[3], 0.0, settings) + sum(observation.ego_size) / 2
-    pace, clear = 2.0 * DT * after[3], own[1] + SIDE_MARGIN
+    pace, clear = 2.0 * STEP * after[3], own[1] + SIDE_MARGIN
     sizes = observation.sizes.tolist()
     for i, (s, d, heading, speed) in enumerate(observation.states.tolist()):
         size = sizes[i]
         # As |sin h| <= |h| and cos h <= 1, the car is at least so far aside: most need no more.
-        turned = abs(heading) * (size[0] / 2 + DT * abs(speed))
+        turned = abs(heading) * (size[0] / 2 + STEP * abs(speed))
         if abs(d - after[1]) - turned - size[1] / 2 > clear:
             continue
         along = speed * cos(heading)
         # Far away however it is turned, and wherever it is a step from now.
-        own_way = 2.0 * DT * speed + (_oncoming_way(-along) if along < 0.0 else 0.0)
+        own_way = 2.0 * STEP * speed + (_oncoming_way(-along) if along < 0.0 else 0.0)
         if abs(s - ego.s) > reach + pace + own_way + (size[0] + size[1]) / 2:
             continue
         other = _extent(heading, size)
-        aside = abs(d + DT * speed * sin(heading) - after[1]) - own[1] - other[1]
+        aside = abs(d + STEP * speed * sin(heading) - after[1]) - own[1] - other[1]
         if aside >= SIDE_MARGIN:
             continue
         stretch = 1.0 - float(observation.curvature[i]) * d
-        ahead = s + DT * along / stretch - after[0] - own[0] - other[0]
+        ahead = s + STEP * along / stretch - after[0] - own[0] - other[0]
         if s > ego.s and aside < 0.0 and ahead < safe_distance(after[3], along, settings):
             if acceleration > hardest + 1e-9:
                 acceleration = hardest
@@ -86,7 +85,7 @@ def checked(plan: Plan, observation: Observation, road: Road, settings: PlannerS
     if not reasons:
         return plan
     safe = Control(curvature, acceleration)
-    after = dynamics.step(ego, safe, DT, settings.friction, bend)
+    after = dynamics.step(ego, safe, STEP, settings.friction, bend)
     return replace(
         plan,
         controls=(safe,),
@@ -109,9 +108,9 @@ def safe_distance(speed: float, speed_ahead: float, settings: PlannerSettings) -
     may accelerate for one more step before it brakes. That it brakes no harder than the car ahead
     can is assumed: then the gap is smallest when both stand.
     """
-    faster = speed + DT * settings.max_acceleration
+    faster = speed + STEP * settings.max_acceleration
     braking = min(settings.max_braking, HARDEST_BRAKING)
-    way = DT * (speed + faster) / 2 + faster**2 / (2 * braking)
+    way = STEP * (speed + faster) / 2 + faster**2 / (2 * braking)
     if speed_ahead < 0.0:
         return way + _oncoming_way(-speed_ahead)
     return max(way - speed_ahead**2 / (2 * HARDEST_BRAKING), 0.0)
@@ -119,4 +118,4 @@ def safe_distance(speed: float, speed_ahead: float, settings: PlannerSettings) -
 
 def _oncoming_way(speed: float) -> float:
     """Metres that a car goes until it stands, if it keeps its speed (m/s) for one more step."""
-    return DT * speed + speed**2 / (2 * ONCOMING_BRAKING)
+    return STEP * speed + speed**2 / (2 * ONCOMING_BRAKING)

@@ -47,7 +47,7 @@ class PlannerSettings(BaseModel):
     constraint : cost per metre too close to a visible car or beyond the road's edge
         (planning.constraints), in units of what cohesion could win by it.
     cars : how many of the nearest vehicles are avoided.
-    solver : ilqr (planning.ilqr), the fast one; fatrop and ipopt, CasADi's interior point methods;
+    solver : ilqr (planning.solvers.ilqr), the fast one; fatrop and ipopt, CasADi's interior point methods;
         lbfgs, the paper's own.
     last_resort : check every plan before it is driven (planning.safety).
     max_iterations : after which a solve has failed. Not a time limit, which would make two

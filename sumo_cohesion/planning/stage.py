@@ -12,9 +12,9 @@ import casadi as ca
 import numpy as np
 
 from sumo_cohesion.planning import constraints, dynamics, reward
-from sumo_cohesion.planning.dynamics import DT
 from sumo_cohesion.planning.settings import PlannerSettings, RewardWeights
 from sumo_cohesion.social.features import FEATURES, social_features
+from sumo_cohesion.state import STEP
 
 SCALES = (0.01, 5.0)
 """Curvature (1/m) and acceleration (m/s²) that solvers see as one."""
@@ -105,7 +105,7 @@ def make_stage(settings: PlannerSettings, parameters: StageParameters) -> Stage:
     p = parameters.symbols()
     physical = [control[i] * SCALES[i] for i in range(2)]
     before = ca.vertsplit(state)[:4]
-    reached = dynamics.step(before, physical, DT, settings.friction, p["road_curvature"])
+    reached = dynamics.step(before, physical, STEP, settings.friction, p["road_curvature"])
     landing = ca.SX.sym("landing", 4)
     after = ca.vertsplit(landing)
     cars = ca.reshape(p["cars"], 6, parameters.n_cars)
@@ -126,7 +126,7 @@ def make_stage(settings: PlannerSettings, parameters: StageParameters) -> Stage:
     theta = dict(zip(RewardWeights.model_fields, ca.vertsplit(p["theta"]), strict=True))
     terms = {name: theta[name] * own[name] for name in RewardWeights.model_fields}
     # Cohesion, eq. 2: distance of the ego's social features from the groups' means.
-    psi = ca.vertcat(*social_features(before, after, DT, p["road_curvature"]))
+    psi = ca.vertcat(*social_features(before, after, STEP, p["road_curvature"]))
     missed, aside = psi - p["cohesion_target"], after[1] - p["place_target"]
     terms["cohesion"] = -ca.dot(p["cohesion_weight"], missed**2) - p["place_weight"] * aside**2
     violation = constraints.violations(after, inputs, p["ego_width"])
@@ -152,7 +152,7 @@ def make_stage(settings: PlannerSettings, parameters: StageParameters) -> Stage:
 
 def standstill(state: Any, settings: PlannerSettings) -> Any:
     """Scaled acceleration that ends a stage at standstill: no car reverses."""
-    return (settings.friction - 1.0 / DT) * state[3] / SCALES[1]
+    return (settings.friction - 1.0 / STEP) * state[3] / SCALES[1]
 
 
 def control_limits(

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from sumo_cohesion.errors import UserError
-from sumo_cohesion.experiments.rollout import Rollout
+from sumo_cohesion.tables.rollout import Rollout
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

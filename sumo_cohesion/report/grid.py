@@ -8,8 +8,8 @@ import numpy as np
 import pandas as pd
 
 from sumo_cohesion.errors import UserError
-from sumo_cohesion.experiments.statistics import mean_interval, wilson
 from sumo_cohesion.report.drawing import EGO_COLOURS, new_figure, save
+from sumo_cohesion.tables.intervals import mean_interval, wilson
 
 
 def intervals(metrics: pd.DataFrame, metric: str, over: list[str]) -> pd.DataFrame:

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pandas as pd
 
-from sumo_cohesion.experiments.rollout import Rollout
 from sumo_cohesion.report import drawing
 from sumo_cohesion.report.drawing import ego_colour, ego_of, humans_of
 from sumo_cohesion.state import FloatArray
+from sumo_cohesion.tables.rollout import Rollout
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist

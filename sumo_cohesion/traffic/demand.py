@@ -16,11 +16,10 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from sumo_cohesion.errors import UserError
+from sumo_cohesion.state import EGO
 from sumo_cohesion.traffic.library import vehicle_type_attributes
 from sumo_cohesion.traffic.network import Network, check_xml
 
-EGO = "ego"
-"""Id of the ego vehicle and of its vehicle type in SUMO."""
 DEMAND_FILE = "demand.rou.xml"
 _DEFAULT_TYPE = "DEFAULT_VEHTYPE"
 """SUMO's type of a vehicle that names none."""

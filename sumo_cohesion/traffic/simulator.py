@@ -18,14 +18,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sumo_cohesion.errors import SimulationError, UserError
-from sumo_cohesion.state import CartesianState, Scene
+from sumo_cohesion.state import EGO, STEP, CartesianState, Scene
 from sumo_cohesion.traffic.contact import contacts
-from sumo_cohesion.traffic.demand import EGO
 from sumo_cohesion.traffic.library import captured_stderr, first_error, load_libsumo, load_window
 from sumo_cohesion.traffic.outputs import SumoOutputs
 
-STEP_LENGTH = 0.1
-"""Seconds per step, of SUMO and of every planner."""
 _POSITION_TOLERANCE = 0.05
 """Metres by which SUMO's car may differ from the driven one. Measured: below 0.001."""
 _KEEP_ROUTE_EXACT = 2
@@ -67,7 +64,7 @@ class SumoRun:
         pairs: dict[str, object] = {
             "net-file": self.network,
             "route-files": self.demand,
-            "step-length": STEP_LENGTH,
+            "step-length": STEP,
             "lateral-resolution": self.lateral_resolution,
             "collision.action": "warn",
             "collision.mingap-factor": 0,

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from sumo_cohesion import run
-from sumo_cohesion.experiments.scenario import scenario_files
-from sumo_cohesion.planning.names import BUILT_IN
+from sumo_cohesion.planning.registry import BUILT_IN
+from sumo_cohesion.simulation.scenario import scenario_files
 
 
 @pytest.mark.parametrize("planner", BUILT_IN)

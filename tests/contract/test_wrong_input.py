@@ -222,7 +222,7 @@ def test_an_unwritable_folder(invoke: Invoke) -> None:
 def test_a_folder_that_cannot_be_made_is_said_before_the_drive(
     invoke: Invoke, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("sumo_cohesion.experiments.simulation.simulate", None)
+    monkeypatch.setattr("sumo_cohesion.simulation.run.simulate", None)
     result = invoke("run", "stalled", "--out", "/proc/nowhere/run")
     assert_one_line(result, "/proc/nowhere/run", "cannot write there")
 

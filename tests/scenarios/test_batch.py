@@ -581,7 +581,7 @@ def test_what_a_kill_has_torn_is_left_out(tmp_path: Path) -> None:
 
 
 def test_threads_may_ask_for_runs_at_once_and_close_ends_them() -> None:
-    from sumo_cohesion.experiments.workers import CallFailedError, Limits, Workers
+    from sumo_cohesion.batches.workers import CallFailedError, Limits, Workers
 
     workers = Workers("time:sleep", Limits(60.0, 1.0))
     ended: list[str] = []

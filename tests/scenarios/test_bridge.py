@@ -17,7 +17,7 @@ import pytest
 
 from sumo_cohesion import run
 from sumo_cohesion.errors import SimulationError, UserError
-from sumo_cohesion.experiments.setup import prepare
+from sumo_cohesion.simulation.setup import prepare
 from sumo_cohesion.state import CartesianState, Scene
 from sumo_cohesion.traffic.contact import contacts
 from sumo_cohesion.traffic.simulator import Simulator, SumoRun
@@ -335,7 +335,7 @@ def test_curved_road_in_closed_loop(tmp_path: Path) -> None:
         'departLane="0" departPos="60"><route edges="straight bend_1 bend_2"/></vehicle></routes>'
     )
     (tmp_path / "curve.net.xml").write_text((NETWORKS / "curve.net.xml").read_text())
-    from sumo_cohesion.experiments.simulation import run
+    from sumo_cohesion.simulation.run import run
 
     rollout = run(tmp_path / "curve.toml", "nominal")
     row = rollout.metrics.iloc[0]
@@ -350,7 +350,7 @@ def test_curved_road_in_closed_loop(tmp_path: Path) -> None:
 
 
 def test_export_opens_in_plain_sumo(tmp_path: Path) -> None:
-    from sumo_cohesion.experiments.export import export_scenario
+    from sumo_cohesion.simulation.export import export_scenario
 
     config = export_scenario("stalled", tmp_path / "out", seed=3)
     assert {p.name for p in config.parent.iterdir()} == {

@@ -9,8 +9,8 @@ import pandas as pd
 import pytest
 
 from sumo_cohesion import Rollout, run
-from sumo_cohesion.planning import mpc
 from sumo_cohesion.planning.problem import Instance, Solution
+from sumo_cohesion.planning.solvers import mpc
 from sumo_cohesion.state import RESCUED, FloatArray
 from sumo_cohesion.traffic.simulator import Simulator
 

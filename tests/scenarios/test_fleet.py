@@ -10,10 +10,10 @@ import pandas as pd
 import pytest
 
 from sumo_cohesion import Rollout, run
-from sumo_cohesion.experiments.fleet import is_equipped
-from sumo_cohesion.experiments.setup import prepare
 from sumo_cohesion.perception.history import History
 from sumo_cohesion.road import Road
+from sumo_cohesion.simulation.fleet import is_equipped
+from sumo_cohesion.simulation.setup import prepare
 from sumo_cohesion.state import Control, Observation, Plan
 
 HERE = "tests.scenarios.test_fleet"

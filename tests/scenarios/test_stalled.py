@@ -12,7 +12,7 @@ import pytest
 
 import sumo_cohesion
 from sumo_cohesion import Rollout, compare, load_metrics, run
-from sumo_cohesion.experiments.columns import TABLES
+from sumo_cohesion.tables.columns import TABLES
 
 TIMED = ["plan_ms_median", "plan_ms_p99"]
 REPEATABLE = ("trajectory", "plan", "agreement")

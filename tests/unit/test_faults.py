@@ -9,13 +9,13 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from sumo_cohesion.experiments.drive import ask, drive
 from sumo_cohesion.perception.history import History
-from sumo_cohesion.planning import mpc
-from sumo_cohesion.planning.planners import CohesivePlanner
+from sumo_cohesion.planning.cohesive import CohesivePlanner
 from sumo_cohesion.planning.problem import Instance, Solution
 from sumo_cohesion.planning.settings import PlannerSettings
+from sumo_cohesion.planning.solvers import mpc
 from sumo_cohesion.road import Road
+from sumo_cohesion.simulation.car import ask, drive
 from sumo_cohesion.social.memory import new_history
 from sumo_cohesion.social.settings import CohesionSettings
 from sumo_cohesion.state import (

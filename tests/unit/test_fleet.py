@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sumo_cohesion.experiments.fleet import Fleet, _near_another, is_equipped
-from sumo_cohesion.experiments.setup import prepare
 from sumo_cohesion.perception.observation import Overview, Sensor
 from sumo_cohesion.road import Road
+from sumo_cohesion.simulation.fleet import Fleet, _near_another, is_equipped
+from sumo_cohesion.simulation.setup import prepare
 from sumo_cohesion.social.features import social_features
 from sumo_cohesion.social.memory import SharedFeatures
 from sumo_cohesion.state import CartesianState, Observation, Scene

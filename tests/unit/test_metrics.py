@@ -6,8 +6,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from sumo_cohesion.experiments import metrics
-from sumo_cohesion.experiments.statistics import mean_interval, summarize, wilson
+from sumo_cohesion.tables import metrics
+from sumo_cohesion.tables.intervals import mean_interval, summarize, wilson
 
 
 def car(name: str, s: np.ndarray, d: float = 0.0, dt: float = 0.1) -> pd.DataFrame:
@@ -128,7 +128,7 @@ def test_mean_interval_covers_and_is_repeatable() -> None:
 
 
 def test_summary_counts_only_runs_where_the_metric_is_defined() -> None:
-    from sumo_cohesion.experiments.columns import METRICS
+    from sumo_cohesion.tables.columns import METRICS
 
     zeros = {"string": "", "bool": False, "int64": 0, "float64": 1.0}
     row = {c.name: zeros[c.dtype] for c in METRICS}

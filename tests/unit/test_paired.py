@@ -9,8 +9,8 @@ import pandas as pd
 import pytest
 
 from sumo_cohesion import UserError
-from sumo_cohesion.batches.paired import compare_planners
 from sumo_cohesion.report.grid import draw_grid, intervals
+from sumo_cohesion.tables.paired import compare_planners
 
 
 def metrics(

@@ -11,11 +11,12 @@ import pytest
 from sumo_cohesion.errors import UserError
 from sumo_cohesion.perception.history import History
 from sumo_cohesion.planning import dynamics
+from sumo_cohesion.planning.cohesive import CohesivePlanner, nearest_cars
 from sumo_cohesion.planning.fallback import fallback
-from sumo_cohesion.planning.mpc import shifted
-from sumo_cohesion.planning.names import make_planner
-from sumo_cohesion.planning.planners import CohesivePlanner, Planner, SumoDriver, nearest_cars
+from sumo_cohesion.planning.planners import Planner, SumoDriver
+from sumo_cohesion.planning.registry import make_planner
 from sumo_cohesion.planning.settings import PlannerSettings
+from sumo_cohesion.planning.solvers.mpc import shifted
 from sumo_cohesion.road import Road
 from sumo_cohesion.social.memory import new_history
 from sumo_cohesion.social.place import NOWHERE, Place

@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 from sumo_cohesion import compare, run
-from sumo_cohesion.experiments import metrics
+from sumo_cohesion.tables import metrics
 
 SHORT = {"reference": True, "duration": 8.0}
 

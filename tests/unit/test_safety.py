@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from sumo_cohesion.planning.cohesive import CohesivePlanner
 from sumo_cohesion.planning.dynamics import step
-from sumo_cohesion.planning.planners import CohesivePlanner
 from sumo_cohesion.planning.safety import ONCOMING_BRAKING, checked, safe_distance
 from sumo_cohesion.planning.settings import PlannerSettings
 from sumo_cohesion.road import Road

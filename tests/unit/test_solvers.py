@@ -14,14 +14,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sumo_cohesion.planning import compiled as compilation
 from sumo_cohesion.planning.dynamics import step
-from sumo_cohesion.planning.ilqr import _box_step
-from sumo_cohesion.planning.mpc import SOLVERS, Mpc
 from sumo_cohesion.planning.problem import FAR_AWAY, Problem, Solution
 from sumo_cohesion.planning.settings import PlannerSettings
+from sumo_cohesion.planning.solvers import compiled as compilation
+from sumo_cohesion.planning.solvers.ilqr import _box_step
+from sumo_cohesion.planning.solvers.mpc import SOLVERS, Mpc
+from sumo_cohesion.planning.solvers.transcription import Transcription
 from sumo_cohesion.planning.stage import UNLIMITED, StageParameters, make_stage
-from sumo_cohesion.planning.transcription import Transcription
 from sumo_cohesion.road import RoadAhead
 from sumo_cohesion.state import Control, RoadState
 from tests.conftest import ROOT
@@ -334,7 +334,7 @@ def test_a_car_that_has_to_stop_stops(solvers: dict[str, Mpc]) -> None:
 CODE = """
 import sys, numpy as np
 from tests.unit.test_solvers import problem, SETTINGS
-from sumo_cohesion.planning.mpc import Mpc
+from sumo_cohesion.planning.solvers.mpc import Mpc
 mpc = Mpc(SETTINGS, 3)
 print(mpc.solver.how)
 for seed in range(20):

@@ -1,28 +1,20 @@
-"""What one run leaves behind: tables, metrics and a description, in memory or in a folder."""
+"""Collects the steps of a run and turns them into its tables."""
 
 from __future__ import annotations
 
-import json
-import platform
-import shutil
-import tempfile
-from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field, replace
-from importlib.metadata import version
-from pathlib import Path
+from collections.abc import Collection
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 
-from sumo_cohesion.errors import UserError
-from sumo_cohesion.experiments.columns import TABLES, as_table
-from sumo_cohesion.experiments.metrics import run_metrics
-from sumo_cohesion.experiments.reference import Reference
 from sumo_cohesion.perception.history import History
 from sumo_cohesion.perception.observation import Sensor
 from sumo_cohesion.planning.explanation import Explanation
+from sumo_cohesion.simulation.twin import Reference
 from sumo_cohesion.state import (
+    EGO,
     AgreementRow,
     BoolArray,
     Control,
@@ -32,119 +24,16 @@ from sumo_cohesion.state import (
     RoadState,
     Scene,
 )
-from sumo_cohesion.traffic.demand import EGO
+from sumo_cohesion.tables.columns import as_table
+from sumo_cohesion.tables.metrics import run_metrics
+from sumo_cohesion.tables.rollout import Rollout
+from sumo_cohesion.versions import versions
 
 if TYPE_CHECKING:
-    from sumo_cohesion.experiments.setup import Setup
+    from sumo_cohesion.simulation.setup import Setup
 
 RUN_FILE = "run.json"
 _NO_CONTROL = Control(float("nan"), float("nan"))
-
-
-@dataclass(frozen=True)
-class Rollout:
-    """The complete record of one run.
-
-    Attributes
-    ----------
-    info : scenario, planner, settings, seed, versions and outcome, ready for JSON.
-    trajectory, plan, horizon, agreement, timing, reference, metrics : tables; see docs/tables.md
-        for their columns.
-    sumo : SUMO's own outputs that were asked for, by kind (traffic.outputs).
-    """
-
-    info: dict[str, Any]
-    trajectory: pd.DataFrame
-    plan: pd.DataFrame
-    horizon: pd.DataFrame
-    agreement: pd.DataFrame
-    timing: pd.DataFrame
-    reference: pd.DataFrame
-    metrics: pd.DataFrame
-    sumo: Mapping[str, pd.DataFrame] = field(default_factory=dict)
-
-    def write(self, folder: Path) -> Path:
-        """Write run.json and one parquet file per table, all of them or none."""
-        require_replaceable(folder, RUN_FILE)
-        with whole_folder(folder) as new:
-            for name in TABLES:
-                getattr(self, name).to_parquet(new / f"{name}.parquet", index=False)
-            for name, table in self.sumo.items():
-                table.to_parquet(new / f"sumo_{name}.parquet", index=False)
-            text = json.dumps(self.info, indent=2, ensure_ascii=False)
-            (new / RUN_FILE).write_text(text + "\n", encoding="utf-8")
-        return folder
-
-    @staticmethod
-    def read(folder: Path) -> Rollout:
-        """Read a folder that `write` wrote."""
-        try:
-            info = json.loads((folder / RUN_FILE).read_text(encoding="utf-8"))
-            tables = {name: pd.read_parquet(folder / f"{name}.parquet") for name in TABLES}
-            found = sorted(folder.glob("sumo_*.parquet"))
-            sumo = {path.stem.removeprefix("sumo_"): pd.read_parquet(path) for path in found}
-        except (OSError, ValueError) as error:
-            raise UserError(f"{folder}: not a complete run ({error}); run it again") from None
-        return Rollout(info=info, sumo=sumo, **tables)
-
-
-def require_replaceable(folder: Path, marker: str) -> None:
-    """Raise UserError unless a folder is new, empty, or an earlier result (holds ``marker``)."""
-    if not folder.exists():
-        return
-    if not folder.is_dir() or (any(folder.iterdir()) and not (folder / marker).is_file()):
-        raise UserError(
-            f"{folder}: holds something else than an earlier result; choose another --out"
-        )
-
-
-def require_writable(folder: Path) -> None:
-    """Raise UserError unless a result can be written to a folder; its parents are made."""
-    _new_sibling(folder).rmdir()
-
-
-def _new_sibling(folder: Path) -> Path:
-    """Make a hidden folder beside one that may not be there yet."""
-    try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        return Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
-    except OSError as error:
-        raise UserError(
-            f"{folder}: cannot write there ({error.strerror}); choose another --out"
-        ) from None
-
-
-class whole_folder:  # noqa: N801 - reads as a function where it is used
-    """Context: write into a temporary sibling that replaces ``folder`` only if all went well."""
-
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
-
-    def __enter__(self) -> Path:
-        self._new = _new_sibling(self._folder)
-        self._new.chmod(0o755)
-        return self._new
-
-    def __exit__(self, kind: type[BaseException] | None, error: object, trace: object) -> None:
-        if kind is None:
-            old = self._new.with_name(self._new.name + "-old")
-            if self._folder.exists():
-                self._folder.rename(old)
-            self._new.rename(self._folder)
-            shutil.rmtree(old, ignore_errors=True)
-            return
-        shutil.rmtree(self._new, ignore_errors=True)
-        if isinstance(error, OSError):
-            raise UserError(
-                f"{self._folder}: cannot write there ({error.strerror or error}); "
-                "free some space or choose another --out"
-            ) from None
-
-
-def versions() -> dict[str, str]:
-    """Versions of everything that can change a result."""
-    packages = ("sumo-cohesion", "libsumo", "sumolib", "casadi", "numpy", "scipy", "pandas")
-    return {"python": platform.python_version()} | {name: version(name) for name in packages}
 
 
 class Ending(NamedTuple):

@@ -10,7 +10,7 @@ Sources: W. Li and E. Todorov 2004 (iterative LQR); Y. Tassa, N. Mansard and E. 
 (control-limited DDP, the line search and the regularisation).
 
 Both passes are CasADi Functions without loops or branches. They run in CasADi's virtual machine,
-and several times faster compiled (planning.compiled).
+and several times faster compiled (planning.solvers.compiled).
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from sumo_cohesion.planning.compiled import BoundCall, Numbers, compiled
 from sumo_cohesion.planning.problem import Instance, Solution
 from sumo_cohesion.planning.settings import PlannerSettings
+from sumo_cohesion.planning.solvers.compiled import BoundCall, Numbers, compiled
 from sumo_cohesion.planning.stage import (
     CONTROL_SCALE,
     N_STATES,

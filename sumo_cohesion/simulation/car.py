@@ -12,8 +12,7 @@ from sumo_cohesion.planning.fallback import fallback
 from sumo_cohesion.planning.planners import Planner
 from sumo_cohesion.planning.settings import PlannerSettings
 from sumo_cohesion.road import Road
-from sumo_cohesion.state import CartesianState, Control, Observation, Plan
-from sumo_cohesion.traffic.simulator import STEP_LENGTH
+from sumo_cohesion.state import STEP, CartesianState, Control, Observation, Plan
 
 SHARPEST, HARDEST = 1.0, 100.0
 """Curvature (1/m) and acceleration (m/s²) beyond which a control is not that of a car."""
@@ -64,7 +63,7 @@ def drive(state: CartesianState, plan: Plan, settings: PlannerSettings) -> Carte
         return None
     curvature, acceleration = plan.controls[0]
     # No car reverses, whatever a planner wants.
-    stop = settings.friction * state.speed - state.speed / STEP_LENGTH
+    stop = settings.friction * state.speed - state.speed / STEP
     control = Control(curvature, max(acceleration, stop))
-    x, y, heading, speed = dynamics.step(state, control, STEP_LENGTH, settings.friction)
+    x, y, heading, speed = dynamics.step(state, control, STEP, settings.friction)
     return CartesianState(float(x), float(y), float(heading), max(float(speed), 0.0))

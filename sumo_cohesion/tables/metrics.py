@@ -12,12 +12,11 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from sumo_cohesion.experiments.columns import as_table
-from sumo_cohesion.state import RESCUED, FloatArray
+from sumo_cohesion.state import EGO, RESCUED, FloatArray
+from sumo_cohesion.tables.columns import as_table
 
 HARD_BRAKE = 4.5
 """m/s², SUMO's default comfortable deceleration: braking harder is not normal driving."""
-_EGO = "ego"
 
 
 def run_metrics(
@@ -29,8 +28,8 @@ def run_metrics(
     reference: pd.DataFrame,
 ) -> pd.DataFrame:
     """All metrics of one run: one row, see columns.METRICS."""
-    ego = trajectory[trajectory["vehicle"] == _EGO]
-    others = trajectory[trajectory["vehicle"] != _EGO]
+    ego = trajectory[trajectory["vehicle"] == EGO]
+    others = trajectory[trajectory["vehicle"] != EGO]
     # A planned car that has touched something is handed to SUMO, but is no human's to drive.
     not_human = [*info["hidden"], *info["special"], *info["fleet"]["touched"]]
     humans = others[~(others["vehicle"].isin(not_human) | others["planned"])]

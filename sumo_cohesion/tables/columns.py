@@ -227,7 +227,7 @@ def describe_tables() -> str:
     parts = [
         "# Tables\n",
         "Every run's folder holds these tables as parquet, and `run.json`: scenario, planner,",
-        "settings, seed, versions and outcome. Made from `sumo_cohesion/experiments/columns.py` by",
+        "settings, seed, versions and outcome. Made from `sumo_cohesion/tables/columns.py` by",
         "`make docs`.\n",
         "A batch's metrics have the columns of `batch`, then scenario, planner, the names of the",
         "grid and seed, then the rest of `metrics`. Tables that a batch kept have the column `run`",

@@ -11,12 +11,12 @@ from typing import Protocol
 
 import numpy as np
 
-from sumo_cohesion.planning.ilqr import Ilqr
-from sumo_cohesion.planning.lbfgs import Lbfgs
-from sumo_cohesion.planning.nlp import InteriorPoint
 from sumo_cohesion.planning.problem import Instance, Problem, Solution
 from sumo_cohesion.planning.settings import PlannerSettings
-from sumo_cohesion.planning.transcription import shared_transcription
+from sumo_cohesion.planning.solvers.ilqr import Ilqr
+from sumo_cohesion.planning.solvers.lbfgs import Lbfgs
+from sumo_cohesion.planning.solvers.nlp import InteriorPoint
+from sumo_cohesion.planning.solvers.transcription import shared_transcription
 from sumo_cohesion.state import RESCUED, FloatArray
 
 

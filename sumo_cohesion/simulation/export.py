@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from sumo_cohesion.experiments.rollout import require_replaceable, whole_folder
-from sumo_cohesion.experiments.setup import prepare
+from sumo_cohesion.simulation.setup import prepare
+from sumo_cohesion.tables.folders import require_replaceable, whole_folder
 
 CONFIG_FILE = "scenario.sumocfg"
 

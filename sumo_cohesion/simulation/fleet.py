@@ -15,20 +15,19 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from sumo_cohesion.experiments.drive import END_OF_ROUTE, ask, drive
 from sumo_cohesion.perception.history import History
 from sumo_cohesion.perception.observation import Overview
-from sumo_cohesion.planning.names import check_road, make_planner
 from sumo_cohesion.planning.planners import Planner
+from sumo_cohesion.planning.registry import make_planner
+from sumo_cohesion.planning.route import check_road
 from sumo_cohesion.road import Road
+from sumo_cohesion.simulation.car import END_OF_ROUTE, ask, drive
 from sumo_cohesion.social.memory import SharedFeatures, new_history
-from sumo_cohesion.state import CartesianState, FloatArray, Scene
+from sumo_cohesion.state import EGO, STEP, CartesianState, FloatArray, Scene
 from sumo_cohesion.traffic.contact import contacts
-from sumo_cohesion.traffic.demand import EGO
-from sumo_cohesion.traffic.simulator import STEP_LENGTH
 
 if TYPE_CHECKING:
-    from sumo_cohesion.experiments.setup import Setup
+    from sumo_cohesion.simulation.setup import Setup
 
 HYSTERESIS = 20.0
 """Metres beyond the ego's sensing range at which a planned car is handed back."""
@@ -198,7 +197,7 @@ class Fleet:
         if _at_end(road, state):
             self._human.add(name)
             return
-        history = new_history(setup.cohesion, STEP_LENGTH, self._features)
+        history = new_history(setup.cohesion, STEP, self._features)
         self._members[name] = _Member(road, planner, history)
         self._were_planned.add(name)
 

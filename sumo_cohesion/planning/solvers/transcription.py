@@ -15,13 +15,12 @@ import casadi as ca
 import numpy as np
 
 from sumo_cohesion.planning import dynamics
-from sumo_cohesion.planning.compiled import BoundCall, compiled
-from sumo_cohesion.planning.dynamics import DT
 from sumo_cohesion.planning.problem import FAR_AWAY, Instance, Problem, Solution
 from sumo_cohesion.planning.settings import PlannerSettings
+from sumo_cohesion.planning.solvers.compiled import BoundCall, compiled
 from sumo_cohesion.planning.stage import N_STATES, SCALES, UNLIMITED, StageParameters
 from sumo_cohesion.social.features import FEATURES
-from sumo_cohesion.state import Control
+from sumo_cohesion.state import STEP, Control
 
 _NOW = {
     "ego": 4,
@@ -178,7 +177,7 @@ def _stage_numbers(settings: PlannerSettings, layout: StageParameters) -> Any:
     edges, place = ca.SX.sym("edges", 2), ca.SX.sym("place", 1, 2)
     theta, limits = ca.SX.sym("theta", layout.sizes["theta"]), ca.SX.sym("limits", len(_LIMITS))
     i = ca.SX.sym("i")
-    ahead = DT * (i + 1)
+    ahead = STEP * (i + 1)
     numbers = {
         "ego_width": parts["ego_size"][1],
         "theta": theta,
@@ -198,7 +197,7 @@ def _stage_numbers(settings: PlannerSettings, layout: StageParameters) -> Any:
     named = dict(zip(_LIMITS, ca.vertsplit(limits), strict=True))
     low, high = control_bounds(named, settings.friction, parts["ego"][3], i)
     most = ca.vertcat(
-        DT * named["max_curvature_rate"] / SCALES[0], DT * named["max_jerk"] / SCALES[1]
+        STEP * named["max_curvature_rate"] / SCALES[0], STEP * named["max_jerk"] / SCALES[1]
     )
     free = ca.logic_and(i < 1, parts["is_driven"] < 1)
     return ca.Function(
@@ -221,7 +220,7 @@ def control_bounds(limits: dict[str, Any], friction: float, speed: Any, i: Any) 
     then: as in PlannerSettings.sharpest, which is for numbers.
     """
     drag = friction * speed
-    fastest = ca.fmax(speed + DT * limits["max_acceleration"] * (i + 1), 1e-3)
+    fastest = ca.fmax(speed + STEP * limits["max_acceleration"] * (i + 1), 1e-3)
     sharpest = ca.fmin(limits["max_curvature"], limits["max_lateral_acceleration"] / fastest**2)
     low = ca.vertcat(-sharpest / SCALES[0], (drag - limits["max_braking"]) / SCALES[1])
     high = ca.vertcat(sharpest / SCALES[0], (drag + limits["max_acceleration"]) / SCALES[1])
@@ -247,7 +246,7 @@ def _check(settings: PlannerSettings, layout: StageParameters) -> Any:
     scaled = controls / ca.repmat(ca.SX(SCALES), 1, t)
     outside = ca.fmax(ca.mmax(low - scaled), ca.mmax(scaled - high))
     first = ca.vertsplit(start)[:4], ca.vertsplit(controls[:, 0])
-    reached = ca.vertcat(start[:4], *dynamics.step(*first, DT, settings.friction, road[-1, 0]))
+    reached = ca.vertcat(start[:4], *dynamics.step(*first, STEP, settings.friction, road[-1, 0]))
     claimed = ca.vertcat(states[:, 0], states[:, 1])
     off = ca.fmax(outside, ca.mmax(ca.fabs(reached - claimed)))
     total = ca.sum1(ca.sum2(states)) + ca.sum1(ca.sum2(controls))

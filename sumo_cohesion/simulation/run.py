@@ -12,28 +12,22 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
-from sumo_cohesion.experiments.drive import END_OF_ROUTE, ask, drive
-from sumo_cohesion.experiments.fleet import Fleet
-from sumo_cohesion.experiments.rollout import (
-    RUN_FILE,
-    Ending,
-    Recorder,
-    Rollout,
-    Seconds,
-    require_replaceable,
-    require_writable,
-)
-from sumo_cohesion.experiments.setup import Setup, prepare
 from sumo_cohesion.perception.observation import Sensor
-from sumo_cohesion.planning.names import make_planner
 from sumo_cohesion.planning.planners import Planner
+from sumo_cohesion.planning.registry import make_planner
 from sumo_cohesion.road import Road
+from sumo_cohesion.simulation.car import END_OF_ROUTE, ask, drive
+from sumo_cohesion.simulation.fleet import Fleet
+from sumo_cohesion.simulation.recorder import Ending, Recorder, Seconds
+from sumo_cohesion.simulation.setup import Setup, prepare
 from sumo_cohesion.social.memory import new_history
-from sumo_cohesion.state import CartesianState, RoadState
+from sumo_cohesion.state import STEP, CartesianState, RoadState
+from sumo_cohesion.tables.folders import require_replaceable, require_writable
+from sumo_cohesion.tables.rollout import RUN_FILE, Rollout
 from sumo_cohesion.traffic.contact import contacts
 from sumo_cohesion.traffic.drivers import Drivers
 from sumo_cohesion.traffic.outputs import Output, SumoOutputs
-from sumo_cohesion.traffic.simulator import STEP_LENGTH, Simulator
+from sumo_cohesion.traffic.simulator import Simulator
 
 _LOST = 10.0
 """Metres from the nearest lane of its route, or off it, beyond which the ego has left both."""
@@ -99,7 +93,7 @@ def simulate(setup: Setup, planner: Planner, *, gui: bool = False) -> Rollout:
     """Run the loop: observe, remember, plan, drive, step SUMO; until contact or the end."""
     scenario, road, sensing = setup.scenario, setup.road, setup.scenario.sensing
     sensor = Sensor(road, sensing.range, sensing.hidden, sensing.special)
-    history = new_history(setup.cohesion, STEP_LENGTH)
+    history = new_history(setup.cohesion, STEP)
     recorder, fleet = Recorder(setup, sensor), Fleet(setup)
     planner.reset(road)
     with (
@@ -128,7 +122,7 @@ def simulate(setup: Setup, planner: Planner, *, gui: bool = False) -> Rollout:
             recorder.add(scene, observation, history, plan, others, seconds)
             scene = following
             touched = contacts(scene.ego, scene.ego_size, scene.states, scene.sizes)
-            finished = scene.time > end - STEP_LENGTH / 2
+            finished = scene.time > end - STEP / 2
             outcome = _outcome(bool(touched.size), observation.ego, scene.ego, road, finished)
         fleet.meet(scene, sumo)  # who touched whom in the last step
         names, told = [scene.ids[i] for i in touched], sumo.reported_contacts()

@@ -18,12 +18,12 @@ import numpy as np
 from sumo_cohesion.perception.history import History
 from sumo_cohesion.perception.observation import Sensor
 from sumo_cohesion.planning import dynamics
-from sumo_cohesion.planning.names import cohesion_of
-from sumo_cohesion.planning.planners import CohesivePlanner
-from sumo_cohesion.state import CartesianState, Observation, Plan, Scene
+from sumo_cohesion.planning.cohesive import CohesivePlanner
+from sumo_cohesion.planning.registry import cohesion_of
+from sumo_cohesion.state import STEP, CartesianState, Observation, Plan, Scene
 
 if TYPE_CHECKING:
-    from sumo_cohesion.experiments.setup import Setup
+    from sumo_cohesion.simulation.setup import Setup
 
 
 class Reference:
@@ -63,5 +63,5 @@ class Reference:
         )
         control = self._of_twin.plan(twin, history).controls[0]
         state = self._twin or scene.ego
-        x, y, heading, speed = dynamics.step(state, control, dynamics.DT, self._friction)
+        x, y, heading, speed = dynamics.step(state, control, STEP, self._friction)
         self._twin = CartesianState(x, y, heading, max(speed, 0.0))

@@ -14,15 +14,16 @@ from urllib.parse import quote
 
 import pandas as pd
 
+from sumo_cohesion.batches.workers import NO_LIMITS, CallFailedError, Workers, processors
 from sumo_cohesion.errors import SimulationError, UserError
-from sumo_cohesion.experiments.metrics import deviation
-from sumo_cohesion.experiments.rollout import RUN_FILE, Rollout, require_replaceable, whole_folder
-from sumo_cohesion.experiments.setup import prepare
-from sumo_cohesion.experiments.simulation import simulate
-from sumo_cohesion.experiments.statistics import summarize
-from sumo_cohesion.experiments.workers import NO_LIMITS, CallFailedError, Workers, processors
-from sumo_cohesion.planning.names import make_planner
-from sumo_cohesion.traffic.demand import EGO
+from sumo_cohesion.planning.registry import make_planner
+from sumo_cohesion.simulation.run import simulate
+from sumo_cohesion.simulation.setup import prepare
+from sumo_cohesion.state import EGO
+from sumo_cohesion.tables.folders import require_replaceable, whole_folder
+from sumo_cohesion.tables.intervals import summarize
+from sumo_cohesion.tables.metrics import deviation
+from sumo_cohesion.tables.rollout import RUN_FILE, Rollout
 
 COMPARISON_FILE = "comparison.json"
 Progress = Callable[[int, int], None]

@@ -13,7 +13,6 @@ import casadi as ca
 import numpy as np
 
 from sumo_cohesion.planning import dynamics
-from sumo_cohesion.planning.dynamics import DT
 from sumo_cohesion.planning.problem import Instance, Solution
 from sumo_cohesion.planning.settings import PlannerSettings
 from sumo_cohesion.planning.stage import (
@@ -25,7 +24,7 @@ from sumo_cohesion.planning.stage import (
     make_stage,
     rate_excess,
 )
-from sumo_cohesion.state import FloatArray
+from sumo_cohesion.state import STEP, FloatArray
 
 
 class InteriorPoint:
@@ -133,6 +132,6 @@ def roll_out(instance: Instance, controls: FloatArray, bends: slice, friction: f
     """Whole states, (T + 1, 6), that controls, (T, 2), lead to; ``bends`` as in the stages."""
     state, rows = instance.start[:4].tolist(), [instance.start]
     for control, bend in zip(controls.tolist(), instance.stages[:, bends].ravel(), strict=True):
-        state = dynamics.step(state, control, DT, friction, float(bend))
+        state = dynamics.step(state, control, STEP, friction, float(bend))
         rows.append(np.array((*state, control[0] / SCALES[0], control[1] / SCALES[1])))
     return np.array(rows)

@@ -11,7 +11,7 @@ import pandas as pd
 from scipy import stats
 
 from sumo_cohesion.errors import UserError
-from sumo_cohesion.experiments.statistics import mean_interval, wilson
+from sumo_cohesion.tables.intervals import mean_interval, wilson
 
 _Z = float(stats.norm.ppf(0.975))
 

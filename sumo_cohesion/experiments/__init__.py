@@ -1,1 +1,0 @@
-"""Experiments: run the walk many times and keep tables."""

@@ -1,0 +1,1 @@
+"""The solvers of the planning problem, and the controller that calls them."""

@@ -1,0 +1,1 @@
+"""One run: a scenario, its cars, the loop, and the record that it leaves."""

@@ -1,0 +1,1 @@
+"""What runs leave behind: tables, their columns, metrics and statistics; nothing else."""
