@@ -35,11 +35,10 @@ import casadi as ca
 import numpy as np
 import pandas as pd
 
-from sumo_cohesion.planning import mpc as mpc_module
 from sumo_cohesion.planning.problem import Instance, Problem, Solution
 from sumo_cohesion.planning.registry import make_planner
 from sumo_cohesion.planning.settings import PlannerSettings
-from sumo_cohesion.planning.solvers.mpc import Mpc, shifted
+from sumo_cohesion.planning.solvers.mpc import Mpc, shared_solver, shifted
 from sumo_cohesion.planning.solvers.nlp import roll_out
 from sumo_cohesion.planning.solvers.transcription import Transcription
 from sumo_cohesion.planning.stage import (
@@ -239,7 +238,7 @@ class Ours:
 
     def __init__(self, settings: PlannerSettings, n_lanes: int, name: str) -> None:
         chosen = settings.model_copy(update={"solver": name})
-        self._solver = mpc_module.SOLVERS[name](chosen, n_lanes)
+        self._solver = shared_solver(name, chosen, n_lanes)
         self.how = self._solver.how
 
     def solve(

@@ -43,6 +43,7 @@ class CohesivePlanner:
         self._election = Election(cohesion)
         self._mpc: Mpc | None = None
         self._driven: Control | None = None
+        self._theta = settings.reward.theta
         self._no_place = np.zeros(settings.horizon)
         # Where the horizon is asked for the others' place: every third step is dense enough.
         self._place_steps = list(range(1, settings.horizon + 1, 3))
@@ -134,6 +135,7 @@ class CohesivePlanner:
             place_target=place_target,
             # The more, the more cohesion could win by coming too close.
             constraint_weight=self.settings.constraint * (1.0 + pressure),
+            theta=self._theta,
             driven=driven,
         )
 

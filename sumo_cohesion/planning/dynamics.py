@@ -7,6 +7,10 @@ from typing import Any
 
 import numpy as np
 
+_LEAST_STRETCH = 0.1
+"""Towards the centre of a bend a metre of s becomes ever shorter, and beyond it the frame has no
+meaning; nothing is taken as nearer to the centre than this share of the bend's radius."""
+
 
 def step(
     state: Any, control: Any, dt: float, friction: float, road_curvature: Any = 0.0
@@ -36,11 +40,27 @@ def step(
     curvature, acceleration = control
     speed = speed + dt * (acceleration - friction * speed)
     # Metres of s per metre driven along the road: more on the inside of a bend.
-    along = 1.0 / (1.0 - road_curvature * d)
+    along = 1.0 / stretch(road_curvature, d)
     heading_next = heading + dt * speed * (curvature - road_curvature * _cos(heading) * along)
     s = s + dt * speed * _cos(heading_next) * along
     d = d + dt * speed * _sin(heading_next)
     return s, d, heading_next, speed
+
+
+def stretch(road_curvature: Any, d: Any) -> Any:
+    """Metres driven along the road at d (m) per metre of s.
+
+    >>> stretch(0.01, 5.0), stretch(0.12, 8.4)
+    (0.95, 0.1)
+    """
+    metres = 1.0 - road_curvature * d
+    if isinstance(metres, float):
+        return max(metres, _LEAST_STRETCH)
+    return (
+        metres.fmax(_LEAST_STRETCH)
+        if hasattr(metres, "fmax")
+        else np.maximum(metres, _LEAST_STRETCH)
+    )
 
 
 def _cos(angle: Any) -> Any:

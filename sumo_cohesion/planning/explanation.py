@@ -8,6 +8,7 @@ from itertools import chain
 from math import cos, sin
 from typing import Any, overload
 
+from sumo_cohesion.planning.dynamics import stretch
 from sumo_cohesion.social.agreement import Agreement
 from sumo_cohesion.social.features import FEATURES, social_features
 from sumo_cohesion.social.place import SCALE, Place
@@ -35,7 +36,7 @@ class Explanation(Sequence[AgreementRow]):
         """Say what was agreed and what ignoring it would cost: by field of AgreementRow."""
         s, d, heading, speed = self.ego
         on = (
-            s + STEP * speed * cos(heading) / (1.0 - self.bend * d),
+            s + STEP * speed * cos(heading) / stretch(self.bend, d),
             d + STEP * speed * sin(heading),
             heading,
             speed,

@@ -44,7 +44,7 @@ def checked(plan: Plan, observation: Observation, road: Road, settings: PlannerS
     bend = road.bend_at(ego.s)
     after = dynamics.step(ego, control, STEP, settings.friction, bend)
     # The curvature with which the ego goes parallel to the road after one step.
-    level = bend * cos(ego.heading) / (1.0 - bend * ego.d)
+    level = bend * cos(ego.heading) / dynamics.stretch(bend, ego.d)
     level -= ego.heading / (STEP * max(after[3], 1.0))
     sharpest = settings.sharpest(max(ego.speed, after[3]))
     level = min(max(level, -sharpest), sharpest)
@@ -69,7 +69,7 @@ def checked(plan: Plan, observation: Observation, road: Road, settings: PlannerS
         aside = abs(d + STEP * speed * sin(heading) - after[1]) - own[1] - other[1]
         if aside >= SIDE_MARGIN:
             continue
-        stretch = 1.0 - float(observation.curvature[i]) * d
+        stretch = dynamics.stretch(float(observation.curvature[i]), d)
         ahead = s + STEP * along / stretch - after[0] - own[0] - other[0]
         if s > ego.s and aside < 0.0 and ahead < safe_distance(after[3], along, settings):
             if acceleration > hardest + 1e-9:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+
+from sumo_cohesion.planning.solvers import SOLVERS
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
@@ -31,6 +33,17 @@ class RewardWeights(BaseModel):
     curvature: NonNegative = 80.0
     acceleration: NonNegative = 1.2e-4
 
+    @property
+    def theta(self) -> tuple[float, ...]:
+        """The weights as a vector, in the order of the fields."""
+        return tuple([getattr(self, name) for name in type(self).model_fields])
+
+
+def _known(solver: str) -> str:
+    if solver not in SOLVERS:
+        raise ValueError(f"there is no such solver; choose {', '.join(SOLVERS)}")
+    return solver
+
 
 class PlannerSettings(BaseModel):
     """The model predictive controller.
@@ -47,7 +60,7 @@ class PlannerSettings(BaseModel):
     constraint : cost per metre too close to a visible car or beyond the road's edge
         (planning.constraints), in units of what cohesion could win by it.
     cars : how many of the nearest vehicles are avoided.
-    solver : ilqr (planning.solvers.ilqr), the fast one; fatrop and ipopt, CasADi's interior point methods;
+    solver : ilqr (solvers.ilqr), the fast one; fatrop and ipopt, CasADi's interior point methods;
         lbfgs, the paper's own.
     last_resort : check every plan before it is driven (planning.safety).
     max_iterations : after which a solve has failed. Not a time limit, which would make two
@@ -66,7 +79,7 @@ class PlannerSettings(BaseModel):
     max_jerk: Positive = 100.0
     constraint: NonNegative = 20.0
     cars: Annotated[int, Field(ge=1, le=100)] = 8
-    solver: Literal["ilqr", "fatrop", "ipopt", "lbfgs"] = "ilqr"
+    solver: Annotated[str, AfterValidator(_known)] = "ilqr"
     max_iterations: Annotated[int, Field(ge=1)] = 100
     last_resort: bool = True
     reward: RewardWeights = RewardWeights()

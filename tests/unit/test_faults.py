@@ -166,7 +166,7 @@ def test_a_faulty_solver_is_noticed_and_rescued(highway: Road, fault: str) -> No
     good = planner.plan(observation, history)
     planner.reset(highway)
     assert planner._mpc is not None
-    planner._mpc.solver = Faulty(planner._mpc.solver, fault)
+    planner._mpc._tools.solver = Faulty(planner._mpc.solver, fault)
     plan = planner.plan(observation, history)
     assert plan.status.startswith(RESCUED)
     assert not plan.fallback
@@ -232,7 +232,7 @@ def planned(planner: CohesivePlanner, ego: RoadState, history: History) -> Plan:
 
 
 def break_solvers(planner: CohesivePlanner) -> None:
-    planner._mpc.solver = Faulty(planner._mpc.solver, "raises")  # type: ignore[union-attr]
+    planner._mpc._tools.solver = Faulty(planner._mpc.solver, "raises")  # type: ignore[union-attr]
     planner._mpc._rescued = lambda *about: about[-1]  # type: ignore[union-attr,method-assign]
 
 

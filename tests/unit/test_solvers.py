@@ -17,9 +17,10 @@ from hypothesis import strategies as st
 from sumo_cohesion.planning.dynamics import step
 from sumo_cohesion.planning.problem import FAR_AWAY, Problem, Solution
 from sumo_cohesion.planning.settings import PlannerSettings
+from sumo_cohesion.planning.solvers import SOLVERS
 from sumo_cohesion.planning.solvers import compiled as compilation
 from sumo_cohesion.planning.solvers.ilqr import _box_step
-from sumo_cohesion.planning.solvers.mpc import SOLVERS, Mpc
+from sumo_cohesion.planning.solvers.mpc import Mpc
 from sumo_cohesion.planning.solvers.transcription import Transcription
 from sumo_cohesion.planning.stage import UNLIMITED, StageParameters, make_stage
 from sumo_cohesion.road import RoadAhead
@@ -59,6 +60,7 @@ def problem(seed: int, horizon: int = 10, cohesion: float = 1.0) -> Problem:
         place_weight=np.full(horizon, cohesion * rng.uniform(0.0, 5.0)),
         place_target=np.full(horizon, rng.uniform(-4.0, 4.0)),
         constraint_weight=20.0 * (1.0 + float(weight.sum())),
+        theta=SETTINGS.reward.theta,
         driven=Control(rng.uniform(-0.01, 0.01), rng.uniform(-8.0, 4.8)) if seed % 2 else None,
     )
 

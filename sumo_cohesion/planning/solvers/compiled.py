@@ -14,6 +14,7 @@ import platform
 import shutil
 import subprocess
 import tempfile
+import threading
 from array import array
 from collections.abc import Sequence
 from importlib.metadata import version
@@ -38,6 +39,8 @@ OPTIONS = (
     "-shared",
 )
 """The three -fno- let calls be inlined that C's rules forbid to inline; no result changes."""
+BUILDING = threading.RLock()
+"""Held while expressions are built: CasADi counts who uses a symbol, and threads miscount."""
 _PATIENCE = 300.0
 """Seconds after which a compiler is given up."""
 

@@ -5,18 +5,18 @@ The problem is written down once (planning.stage); which solver solves it is a s
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import lru_cache, partial
+import threading
+from functools import lru_cache
+from importlib import import_module
 from typing import Protocol
 
 import numpy as np
 
 from sumo_cohesion.planning.problem import Instance, Problem, Solution
-from sumo_cohesion.planning.settings import PlannerSettings
-from sumo_cohesion.planning.solvers.ilqr import Ilqr
-from sumo_cohesion.planning.solvers.lbfgs import Lbfgs
-from sumo_cohesion.planning.solvers.nlp import InteriorPoint
-from sumo_cohesion.planning.solvers.transcription import shared_transcription
+from sumo_cohesion.planning.settings import PlannerSettings, RewardWeights
+from sumo_cohesion.planning.solvers import SOLVERS
+from sumo_cohesion.planning.solvers.compiled import BUILDING
+from sumo_cohesion.planning.solvers.transcription import Transcription
 from sumo_cohesion.state import RESCUED, FloatArray
 
 
@@ -30,18 +30,48 @@ class Solver(Protocol):
         """Solve one instance from guessed controls, (T, 2); a failure is not ``solved``."""
 
 
-SOLVERS: dict[str, Callable[[PlannerSettings, int], Solver]] = {
-    "ilqr": Ilqr,
-    "fatrop": partial(InteriorPoint, name="fatrop"),
-    "ipopt": partial(InteriorPoint, name="ipopt"),
-    "lbfgs": Lbfgs,
-}
+class _Built(threading.local):
+    """What one thread has built: solvers work in arrays of their own, which no two may share."""
+
+    def __init__(self) -> None:
+        self.solver = lru_cache(maxsize=32)(_build_solver)
+        self.transcription = lru_cache(maxsize=32)(_build_transcription)
 
 
-@lru_cache(maxsize=32)
+def _build_solver(name: str, settings: PlannerSettings, n_lanes: int) -> Solver:
+    module, _, maker = SOLVERS[name].partition(":")
+    with BUILDING:
+        make = getattr(import_module(f"{__package__}.{module}"), maker)
+        solver: Solver = make(settings, n_lanes)
+    return solver
+
+
+def _build_transcription(settings: PlannerSettings, n_lanes: int) -> Transcription:
+    with BUILDING:
+        return Transcription(settings, n_lanes)
+
+
+_BUILT = _Built()
+
+
 def shared_solver(name: str, settings: PlannerSettings, n_lanes: int) -> Solver:
-    """Return a solver, built once per process: it remembers nothing between two solves."""
-    return SOLVERS[name](settings, n_lanes)
+    """Return a solver, built once per thread: it remembers nothing between two solves.
+
+    The reward weights are part of the problem: they need no solver of their own.
+    """
+    return _BUILT.solver(name, _shape(settings), n_lanes)
+
+
+def _shape(settings: PlannerSettings) -> PlannerSettings:
+    return settings.model_copy(update={"reward": RewardWeights()})
+
+
+class _Tools(threading.local):
+    """What a controller works with; each thread that uses it gets its own."""
+
+    def __init__(self, settings: PlannerSettings, n_lanes: int) -> None:
+        self.solver = shared_solver(settings.solver, settings, n_lanes)
+        self.transcription = _BUILT.transcription(_shape(settings), n_lanes)
 
 
 class Mpc:
@@ -56,11 +86,15 @@ class Mpc:
     def __init__(self, settings: PlannerSettings, n_lanes: int) -> None:
         self.settings = settings
         self.n_lanes = n_lanes
-        self.solver = shared_solver(settings.solver, settings, n_lanes)
-        self._transcription = shared_transcription(settings, n_lanes)
+        self._tools = _Tools(settings, n_lanes)
         self._last: Solution | None = None
         self._warm = False
         self._age = 0
+
+    @property
+    def solver(self) -> Solver:
+        """The chosen solver, of this thread."""
+        return self._tools.solver
 
     @property
     def how(self) -> str:
@@ -89,7 +123,7 @@ class Mpc:
     def solve(self, problem: Problem) -> Solution:
         """Solve one instance; never raises for a solver's failure, see ``solved``."""
         self._age += 1
-        instance = self._transcription.write(problem)
+        instance = self._tools.transcription.write(problem)
         if instance is None:
             # Some solvers never return from a problem that is not a number.
             return _failed("input is not finite")
@@ -111,7 +145,7 @@ class Mpc:
             raise  # nothing else would work either
         except Exception as error:
             return _failed(f"{solver.name} raised {type(error).__name__}: {error}")
-        if solution.solved and not self._transcription.is_solution(solution):
+        if solution.solved and not self._tools.transcription.is_solution(solution):
             return _failed(f"{solver.name} returned garbage", solution)
         return solution
 

@@ -6,6 +6,7 @@ fatrop uses the structure of the horizon; IPOPT is general, slower and sturdier.
 
 from __future__ import annotations
 
+import threading
 import time
 from typing import Any
 
@@ -25,6 +26,19 @@ from sumo_cohesion.planning.stage import (
     rate_excess,
 )
 from sumo_cohesion.state import STEP, FloatArray
+
+_ONE_AT_A_TIME = threading.Lock()
+"""IPOPT's linear solver, MUMPS, keeps numbers that all threads share."""
+
+
+def fatrop(settings: PlannerSettings, n_lanes: int) -> InteriorPoint:
+    """Make the solver that uses the structure of the horizon."""
+    return InteriorPoint(settings, n_lanes, "fatrop")
+
+
+def ipopt(settings: PlannerSettings, n_lanes: int) -> InteriorPoint:
+    """Make the general one, slower and sturdier."""
+    return InteriorPoint(settings, n_lanes, "ipopt")
 
 
 class InteriorPoint:
@@ -86,8 +100,11 @@ class InteriorPoint:
         )
         lower, upper = self._bounds(instance)
         x0 = self._pack(instance, guess)
-        result = self._solver(x0=x0, p=parameters, lbx=lower, ubx=upper, lbg=self._lowest, ubg=0.0)
-        stats = self._solver.stats()
+        with _ONE_AT_A_TIME:
+            result = self._solver(
+                x0=x0, p=parameters, lbx=lower, ubx=upper, lbg=self._lowest, ubg=0.0
+            )
+            stats = self._solver.stats()
         z = np.asarray(result["x"]).ravel()
         solved = bool(stats["success"]) and bool(np.isfinite(z.sum()))
         states, controls = self._unpack(z)

@@ -7,7 +7,6 @@ because as many small array operations would take longer than the solver.
 
 from __future__ import annotations
 
-from functools import lru_cache
 from math import isfinite
 from typing import Any
 
@@ -48,19 +47,11 @@ _HAIR = 1e-3
 """How far a solution may be from what it should be, in scaled controls and in SI units."""
 
 
-@lru_cache(maxsize=32)
-def shared_transcription(settings: PlannerSettings, n_lanes: int) -> Transcription:
-    """Return a transcription, built once per process.
-
-    One plan after the other: writing, solving and checking must not be interleaved.
-    """
-    return Transcription(settings, n_lanes)
-
-
 class Transcription:
     """Writes the instances of problems of one shape, and checks their solutions.
 
-    Roads have up to ``n_lanes`` lanes.
+    Roads have up to ``n_lanes`` lanes. One plan after the other: writing, solving and checking
+    must not be interleaved.
     """
 
     def __init__(self, settings: PlannerSettings, n_lanes: int) -> None:
@@ -77,9 +68,9 @@ class Transcription:
         self._instance = Instance(f(N_STATES), f((t, layout.size)), f((t, 2)), f((t, 2)), f((t, 2)))
         settings = self._settings
         limits = np.array([getattr(settings, name) for name in _LIMITS])
-        theta = np.array(list(settings.reward.model_dump().values()))
+        self._theta = f(layout.sizes["theta"])
         # A C-ordered (T, n) array is a CasADi matrix of T columns.
-        given = [self._now, self._cars, self._road, self._edges, self._place, theta, limits]
+        given = [self._now, self._cars, self._road, self._edges, self._place, self._theta, limits]
         written = self._instance
         self._write = BoundCall(
             write,
@@ -109,6 +100,7 @@ class Transcription:
         self._cars[: len(cars)], self._cars[len(cars) :] = cars, _NO_CAR
         self._road[:], self._edges[:] = problem.road
         self._place[0], self._place[1] = problem.place_weight, problem.place_target
+        self._theta[:] = problem.theta
         self._write()
         return self._instance if isfinite(self._sum[0]) else None
 
@@ -160,7 +152,7 @@ def _moving(settings: PlannerSettings) -> Any:
         0.5 * (own + other)
         for own, other in zip(ca.vertsplit(parts["ego_size"]), (length, width), strict=True)
     )
-    velocity = speed * along / (1.0 - curvature * d), speed * across
+    velocity = speed * along / dynamics.stretch(curvature, d), speed * across
     rows = ca.vertcat(s, d, along, across, half_length, half_width, *velocity)
     return ca.Function("moving", [ca.vertcat(*parts.values()), cars], [rows])
 
