@@ -19,6 +19,7 @@ from sumo_cohesion.planning.landscape import reward_landscape
 from sumo_cohesion.report import paper
 from sumo_cohesion.report.drawing import save
 from sumo_cohesion.road import Road
+from sumo_cohesion.simulation.request import RunRequest
 from sumo_cohesion.simulation.setup import prepare
 from sumo_cohesion.state import FloatArray, Observation, RoadState
 
@@ -62,7 +63,7 @@ def seen(rollout: Rollout, road: Road, time: float) -> Observation:
 
 
 def features(scenario: str) -> Figure:
-    setup = prepare(scenario, "nominal", SEED)
+    setup = prepare(RunRequest(scenario, "nominal", SEED))
     rollout = run(scenario, "nominal", SEED)
     observation = seen(rollout, setup.road, FEATURES_AT)
     ego = observation.ego

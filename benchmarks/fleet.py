@@ -24,16 +24,18 @@ import pandas as pd
 import pytest
 
 from benchmarks.rooms import write_highway
-from sumo_cohesion.perception.observation import Overview
-from sumo_cohesion.planning.registry import make_planner
+from sumo_cohesion.perception.observation import Overview, Sensor
 from sumo_cohesion.planning.settings import PlannerSettings
 from sumo_cohesion.planning.solvers.compiled import BoundCall, compiled
 from sumo_cohesion.planning.solvers.ilqr import _backward_pass
 from sumo_cohesion.planning.stage import StageParameters, make_stage
 from sumo_cohesion.simulation import fleet as fleet_module
+from sumo_cohesion.simulation.car import PlannedCar
 from sumo_cohesion.simulation.fleet import Fleet
+from sumo_cohesion.simulation.request import RunRequest
 from sumo_cohesion.simulation.run import simulate
 from sumo_cohesion.simulation.setup import prepare
+from sumo_cohesion.state import Observation, Plan
 from sumo_cohesion.tables.rollout import Rollout
 from sumo_cohesion.versions import versions
 
@@ -91,7 +93,8 @@ class Clock:
         self.steps: list[dict[str, float]] = []
 
     def add(self, part: str, seconds: float) -> None:
-        self.steps[-1][part] += seconds
+        if self.steps:  # the ego looks around before the fleet does
+            self.steps[-1][part] += seconds
 
     def timed(self, part: str, function: Callable[..., Any]) -> Callable[..., Any]:
         """Return the function, its wall time counted for a part."""
@@ -108,32 +111,26 @@ class Clock:
 @contextmanager
 def listening(clock: Clock) -> Iterator[None]:
     """Count what the fleet, and nobody else, spends in each room."""
-    new_history, ask_planner = fleet_module.new_history, fleet_module.ask
 
-    def history(*arguments: Any) -> Any:
-        made = new_history(*arguments)
-        made.push = clock.timed("memory", made.push)
-        return made
+    class TimedCar(PlannedCar):
+        def step(self, observation: Observation) -> Plan:
+            plan = super().step(observation)
+            remembering, planning = self.spent
+            clock.add("memory", remembering)
+            clock.add("social", plan.social_time)
+            clock.add("solver", plan.wall_time)
+            clock.add("rest of the planner", planning - plan.social_time - plan.wall_time)
+            return plan
 
-    def ask(*arguments: Any) -> Any:
-        start = perf_counter()
-        plan = ask_planner(*arguments)
-        whole = perf_counter() - start
-        clock.add("social", plan.social_time)
-        clock.add("solver", plan.wall_time)
-        clock.add("rest of the planner", whole - plan.social_time - plan.wall_time)
-        return plan
-
-    def drive(self: Fleet, scene: Any) -> Any:
+    def drive(self: Fleet, scene: Any, overview: Any) -> Any:
         clock.steps.append(defaultdict(float))
-        return whole(self, scene)
+        return whole(self, scene, overview)
 
     whole = Fleet.drive
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Overview, "along", staticmethod(clock.timed("projection", Overview.along)))
+        patch.setattr(Sensor, "survey", clock.timed("projection", Sensor.survey))
         patch.setattr(Overview, "seen_by", clock.timed("perception", Overview.seen_by))
-        patch.setattr(fleet_module, "new_history", history)
-        patch.setattr(fleet_module, "ask", ask)
+        patch.setattr(fleet_module, "PlannedCar", TimedCar)
         patch.setattr(Fleet, "drive", drive)
         yield
 
@@ -142,10 +139,11 @@ def crowd(planner: str, seconds: float, follow: bool) -> tuple[Rollout, pd.DataF
     """One run: its rollout, and milliseconds per step and part."""
     clock = Clock()
     with tempfile.TemporaryDirectory() as folder, listening(clock):
-        setup = prepare(
+        request = RunRequest(
             write_crowd(Path(folder), seconds), planner, 0, {"cohesion.follow_egos": follow}
         )
-        rollout = simulate(setup, make_planner(planner, setup.settings, setup.cohesion))
+        setup = prepare(request)
+        rollout = simulate(setup)
     table = rollout.trajectory
     others = table[table["planned"] & (table["vehicle"] != "ego")]
     count = others.groupby("time").size().reindex(rollout.timing["time"], fill_value=0)

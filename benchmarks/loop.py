@@ -20,7 +20,7 @@ from typing import Any
 import pandas as pd
 
 from benchmarks.rooms import SCENARIO, write_highway
-from sumo_cohesion.planning.registry import make_planner
+from sumo_cohesion.simulation.request import RunRequest
 from sumo_cohesion.simulation.run import simulate
 from sumo_cohesion.simulation.setup import prepare
 from sumo_cohesion.tables.rollout import Rollout
@@ -58,7 +58,7 @@ def _place(i: int) -> int:
 
 def bare(path: Path, seed: int, steps: int) -> float:
     """CPU seconds of SUMO alone: the same start and as many steps."""
-    setup = prepare(path, "sumo", seed)
+    setup = prepare(RunRequest(path, "sumo", seed))
     with tempfile.TemporaryDirectory() as folder:
         start = time.process_time()
         sumo = load_libsumo()
@@ -71,11 +71,10 @@ def bare(path: Path, seed: int, steps: int) -> float:
 
 def looped(path: Path, planner: str, seed: int) -> tuple[float, Rollout]:
     """CPU seconds of a run in the closed loop, its planner ready."""
-    setup = prepare(path, planner, seed)
-    driver = make_planner(planner, setup.settings, setup.cohesion)
-    driver.reset(setup.road)
+    setup = prepare(RunRequest(path, planner, seed))
+    setup.make_planner().reset(setup.road)  # solvers are built once
     start = time.process_time()
-    rollout = simulate(setup, driver)
+    rollout = simulate(setup)
     return time.process_time() - start, rollout
 
 

@@ -36,7 +36,6 @@ import numpy as np
 import pandas as pd
 
 from sumo_cohesion.planning.problem import Instance, Problem, Solution
-from sumo_cohesion.planning.registry import make_planner
 from sumo_cohesion.planning.settings import PlannerSettings
 from sumo_cohesion.planning.solvers.mpc import Mpc, shared_solver, shifted
 from sumo_cohesion.planning.solvers.nlp import roll_out
@@ -49,6 +48,7 @@ from sumo_cohesion.planning.stage import (
     make_stage,
     rate_excess,
 )
+from sumo_cohesion.simulation.request import RunRequest
 from sumo_cohesion.simulation.run import simulate
 from sumo_cohesion.simulation.setup import prepare
 from sumo_cohesion.versions import versions
@@ -72,8 +72,8 @@ def record(horizon: int, n: int) -> list[Problem]:
 
         Mpc.solve = solve  # type: ignore[method-assign]
         try:
-            setup = prepare(scenario, "cohesive", seed, {"planner.horizon": horizon})
-            simulate(setup, make_planner("cohesive", setup.settings, setup.cohesion))
+            setup = prepare(RunRequest(scenario, "cohesive", seed, {"planner.horizon": horizon}))
+            simulate(setup)
         finally:
             Mpc.solve = original  # type: ignore[method-assign]
         first = len(met) // 2

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from sumo_cohesion.planning.registry import make_planner
+from sumo_cohesion.simulation.request import RunRequest
 from sumo_cohesion.simulation.run import simulate
 from sumo_cohesion.simulation.setup import prepare
 from sumo_cohesion.traffic.simulator import Simulator
@@ -54,8 +54,8 @@ def timed_rollout(scenario: str | Path, seed: int, overrides: dict[str, Any]) ->
 
     Simulator.step = step  # type: ignore[method-assign]
     try:
-        setup = prepare(scenario, "cohesive", seed, overrides)
-        rollout = simulate(setup, make_planner("cohesive", setup.settings, setup.cohesion))
+        setup = prepare(RunRequest(scenario, "cohesive", seed, overrides))
+        rollout = simulate(setup)
     finally:
         Simulator.step = original  # type: ignore[method-assign]
     return rollout.timing.assign(step_ms=steps[: len(rollout.timing)])

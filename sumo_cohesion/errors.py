@@ -1,5 +1,7 @@
 """The two ways a run can go wrong that are not a programming error."""
 
+from __future__ import annotations
+
 
 class UserError(Exception):
     """The user's input is wrong; the message is one line that says what and how to mend it."""
@@ -10,6 +12,21 @@ class UserError(Exception):
 
 class SimulationError(Exception):
     """SUMO did something that would make the results untrue; the message is one line."""
+
+
+class StoppedError(UserError):
+    """SUMO stopped in the middle of a run, over something in its input that it met only then.
+
+    ``rollout`` is the record of the run until then (tables.rollout.Rollout), if there is any.
+    """
+
+    rollout: object = None
+
+    def said(self, more: str) -> StoppedError:
+        """Return the same error, with more to say."""
+        error = StoppedError(f"{self}; {more}")
+        error.rollout = self.rollout
+        return error
 
 
 class StorageError(UserError):

@@ -87,6 +87,18 @@ class Road:
     _strips: FloatArray = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
+        # All runs of a process share a road: what one planner did to it would reach the others.
+        for array in (
+            self.x,
+            self.y,
+            self.tangent_x,
+            self.tangent_y,
+            self.curvature,
+            self.lane_centre,
+            self.lane_width,
+            self.speed_limit,
+        ):
+            array.flags.writeable = False
         vertices = np.column_stack((self.x, self.y))
         tangents = np.column_stack((self.tangent_x, self.tangent_y))
         heading = np.unwrap(np.arctan2(self.tangent_y, self.tangent_x))
@@ -115,6 +127,8 @@ class Road:
         everything = np.column_stack((ahead, strips.reshape(len(ahead), -1)))
         object.__setattr__(self, "_same_until", _same_until(everything))
         object.__setattr__(self, "_looked_up", {})
+        for array in (centre, ahead, strips):
+            array.flags.writeable = False
 
     def index(self, s: ArrayLike) -> IntArray:
         """Vertex nearest to each arc length s (m)."""

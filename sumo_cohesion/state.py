@@ -56,6 +56,8 @@ class Control(NamedTuple):
 
 
 def _require_finite(name: str, values: FloatArray, shape: tuple[int, int]) -> None:
+    """Check an array that several rooms share, and make it read-only."""
+    values.flags.writeable = False
     if values.shape != shape:
         raise ValueError(f"{name} must have shape {shape}, not {values.shape}")
     # A sum is finite only if every summand is, and is much cheaper than isfinite().all().
@@ -117,6 +119,7 @@ class Observation:
 
     def __post_init__(self) -> None:
         _require_finite("Observation.states", self.states, (len(self.ids), 4))
+        self.sizes.flags.writeable = self.curvature.flags.writeable = False
         if len(self.voter) != len(self.ids):
             raise ValueError(f"Observation.voter must have {len(self.ids)} flags")
         if not isfinite(sum(self.ego)):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -171,18 +171,18 @@ def _tables(asked: Experiment) -> tuple[str, ...]:
 
 
 def _job(run: str, seed: int, asked: Experiment, work: Work, out: str) -> Job:
-    point = work.points[run]
-    return Job(run, point.scenario, point.planner, seed, point.overrides, _tables(asked), out)
+    return Job(run, work.points[run].request(seed), _tables(asked), out)
 
 
 def _check(jobs: list[Job]) -> None:
     """Refuse wrong input before anything is run: networks, demand, the range of seeds."""
     by_point: dict[str, list[Job]] = {}
     for job in jobs:
-        by_point.setdefault(repr((job.scenario, job.planner, job.overrides)), []).append(job)
+        by_point.setdefault(repr(replace(job.request, seed=0)), []).append(job)
     for some in by_point.values():
-        for seed in {min(job.seed for job in some), max(job.seed for job in some)}:
-            prepare(some[0].scenario, some[0].planner, seed, some[0].overrides)
+        seeds = [job.request.seed for job in some]
+        for seed in {min(seeds), max(seeds)}:
+            prepare(replace(some[0].request, seed=seed))
 
 
 class _Engine(NamedTuple):
@@ -276,7 +276,7 @@ def _run(
             if row["status"] in _WORTH_RETRYING and attempt <= asked.limits.retries:
                 submit(job, attempt + 1)
                 continue
-            names = {"run": job.run, "planner": job.planner, "seed": job.seed}
+            names = {"run": job.run, "planner": job.request.planner, "seed": job.request.seed}
             store.add({**row, **names, "attempts": attempt})
             done, failed = done + 1, failed + (row["status"] != DONE)
             if progress is not None:

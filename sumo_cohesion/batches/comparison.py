@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from dataclasses import dataclass
@@ -16,14 +15,15 @@ import pandas as pd
 
 from sumo_cohesion.batches.workers import NO_LIMITS, CallFailedError, Workers, processors
 from sumo_cohesion.errors import SimulationError, UserError
-from sumo_cohesion.planning.registry import make_planner
+from sumo_cohesion.planning.registry import AnyPlanner, planner_name
+from sumo_cohesion.simulation.request import RunRequest
 from sumo_cohesion.simulation.run import simulate
 from sumo_cohesion.simulation.setup import prepare
 from sumo_cohesion.state import EGO
-from sumo_cohesion.tables.folders import require_replaceable, whole_folder
+from sumo_cohesion.tables.folders import keep, require_replaceable, whole_folder
 from sumo_cohesion.tables.intervals import summarize
 from sumo_cohesion.tables.metrics import deviation
-from sumo_cohesion.tables.rollout import RUN_FILE, Rollout
+from sumo_cohesion.tables.rollout import RUN_FILE
 
 COMPARISON_FILE = "comparison.json"
 Progress = Callable[[int, int], None]
@@ -48,16 +48,13 @@ class _Result(NamedTuple):
 
 @dataclass(frozen=True)
 class _Job:
-    scenario: str
-    planner: str
-    seed: int
-    overrides: tuple[tuple[str, Any], ...]
+    request: RunRequest
     out: Path | None
 
 
 def compare(
     scenario: str | Path,
-    planners: Sequence[str] = ("nominal", "cohesive"),
+    planners: Sequence[AnyPlanner] = ("nominal", "cohesive"),
     seeds: Sequence[int] = tuple(range(20)),
     *,
     overrides: Mapping[str, Any] | None = None,
@@ -70,7 +67,8 @@ def compare(
     Parameters
     ----------
     scenario, overrides : as for run().
-    planners : names as for run().
+    planners : as for run(). Classes and objects cannot leave this process: their runs are done in
+        it, one after the other, the others' in processes of their own.
     seeds : each gives all planners the same traffic.
     workers : processes; one simulation runs in each. Default: one per processor.
     out : folder for all runs, their metrics, the summary and a picture. It must not exist, be
@@ -87,31 +85,30 @@ def compare(
     """
     if not planners or not seeds:
         raise UserError("nothing to compare: give at least one planner and one seed")
-    for name, values in (("planner", planners), ("seed", seeds)):
+    for name, values in (("planner", [planner_name(p) for p in planners]), ("seed", seeds)):
         repeated = [v for v in values if list(values).count(v) > 1]
         if repeated:
             raise UserError(f"{name} {repeated[0]} is listed twice")
-    for planner in planners:
-        for seed in (min(seeds), max(seeds)):
-            prepare(scenario, planner, seed, overrides)
+    requests = [RunRequest(str(scenario), p, s, overrides or {}) for p in planners for s in seeds]
+    for request in requests:
+        if request.seed in (min(seeds), max(seeds)):
+            prepare(request)
     folder = Path(out) if out is not None else None
-    settings = tuple(sorted((overrides or {}).items()))
     if folder is None:
-        jobs = [_Job(str(scenario), p, s, settings, None) for p in planners for s in seeds]
+        jobs = [_Job(request, None) for request in requests]
         return _compared(jobs, _run_all(jobs, workers, progress), None)
-    require_replaceable(folder, COMPARISON_FILE)
+    require_replaceable(folder)
     with whole_folder(folder) as new:
         jobs = [
-            _Job(str(scenario), p, s, settings, run_folder(new, p, s))
-            for p in planners
-            for s in seeds
+            _Job(request, run_folder(new, planner_name(request.planner), request.seed))
+            for request in requests
         ]
         try:
             results = _run_all(jobs, workers, progress)
         except (SimulationError, UserError, KeyboardInterrupt) as error:
-            kept = _keep(new, folder)
-            if kept is None:
+            if not any(new.rglob(RUN_FILE)):
                 raise
+            kept = keep(new, folder)
             kind = UserError if isinstance(error, UserError) else SimulationError
             reason = str(error) or "interrupted"
             raise kind(f"{reason}; finished runs are kept in {kept}") from None
@@ -120,9 +117,9 @@ def compare(
         comparison.summary.to_parquet(new / "summary.parquet", index=False)
         about = {
             "scenario": str(scenario),
-            "planners": list(planners),
+            "planners": [planner_name(planner) for planner in planners],
             "seeds": list(seeds),
-            "overrides": dict(settings),
+            "overrides": dict(overrides or {}),
         }
         (new / COMPARISON_FILE).write_text(json.dumps(about, indent=2) + "\n", encoding="utf-8")
     return comparison
@@ -140,23 +137,16 @@ def run_folder(folder: Path, planner: str, seed: int) -> Path:
     return folder / name / f"seed_{seed:04d}"
 
 
-def _keep(new: Path, folder: Path) -> Path | None:
-    """Move the finished runs of a comparison that broke off beside its folder."""
-    if not any(new.rglob(RUN_FILE)):
-        return None
-    kept = folder.with_name(folder.name + ".unfinished")
-    shutil.rmtree(kept, ignore_errors=True)
-    new.rename(kept)
-    return kept
-
-
 def _compared(jobs: Sequence[_Job], results: Sequence[_Result], folder: Path | None) -> Comparison:
     runs = pd.concat([result.metrics for result in results], ignore_index=True)
-    nominal = {j.seed: r.path for j, r in zip(jobs, results, strict=True) if j.planner == "nominal"}
-    for i, (job, result) in enumerate(zip(jobs, results, strict=True)):
-        if job.seed in nominal:
+    asked = [job.request for job in jobs]
+    nominal = {
+        a.seed: r.path for a, r in zip(asked, results, strict=True) if a.planner == "nominal"
+    }
+    for i, (request, result) in enumerate(zip(asked, results, strict=True)):
+        if request.seed in nominal:
             runs.loc[i, ["nominal_lateral_deviation", "nominal_speed_deviation"]] = deviation(
-                result.path, nominal[job.seed]
+                result.path, nominal[request.seed]
             )
     return Comparison(runs, summarize(runs), folder)
 
@@ -175,8 +165,11 @@ def _run_all(jobs: Sequence[_Job], workers: int | None, progress: Progress | Non
 def _results(jobs: Sequence[_Job], count: int) -> Iterator[tuple[int, _Result]]:
     workers = Workers(f"{__name__}:_run_job", NO_LIMITS)
     executor = ThreadPoolExecutor(count)
+    by_name = [i for i, job in enumerate(jobs) if isinstance(job.request.planner, str)]
     try:
-        waiting = {executor.submit(workers.call, job): i for i, job in enumerate(jobs)}
+        waiting = {executor.submit(workers.call, jobs[i]): i for i in by_name}
+        for i in sorted(set(range(len(jobs))) - set(by_name)):
+            yield i, _run_job(jobs[i])
         while waiting:
             for future in wait(waiting, return_when=FIRST_COMPLETED).done:
                 yield waiting.pop(future), future.result()
@@ -188,8 +181,7 @@ def _results(jobs: Sequence[_Job], count: int) -> Iterator[tuple[int, _Result]]:
 
 
 def _run_job(job: _Job) -> _Result:
-    setup = prepare(job.scenario, job.planner, job.seed, dict(job.overrides))
-    rollout: Rollout = simulate(setup, make_planner(job.planner, setup.settings, setup.cohesion))
+    rollout = simulate(prepare(job.request))
     if job.out is not None:
         rollout.write(job.out)
     table = rollout.trajectory

@@ -25,6 +25,7 @@ from pydantic import (
 from sumo_cohesion.batches.identity import point_digest, run_key
 from sumo_cohesion.errors import UserError
 from sumo_cohesion.planning.registry import check_planner
+from sumo_cohesion.simulation.request import RunRequest
 from sumo_cohesion.simulation.setup import resolve
 from sumo_cohesion.traffic.outputs import Output
 from sumo_cohesion.user_input import parse_seeds, read_toml, validated
@@ -147,10 +148,9 @@ class Point:
     grid: Mapping[str, Value]
     fixed: Mapping[str, Any]
 
-    @property
-    def overrides(self) -> dict[str, Any]:
-        """Settings by dotted name."""
-        return {**self.fixed, **self.grid}
+    def request(self, seed: int = 0) -> RunRequest:
+        """Return one of its runs."""
+        return RunRequest(self.scenario, self.planner, seed, {**self.fixed, **self.grid})
 
 
 @dataclass(frozen=True)
@@ -196,7 +196,7 @@ def spell_out(experiment: Experiment) -> Work:
     points: dict[str, Point] = {}
     sources: dict[str, str] = {}
     for point in experiment.points():
-        inputs = resolve(point.scenario, point.planner, point.overrides)
+        inputs = resolve(point.request())
         check_planner(point.planner)
         name = inputs.scenario.name
         if sources.setdefault(name, point.scenario) != point.scenario:

@@ -11,8 +11,8 @@ import pandas as pd
 
 from sumo_cohesion.batches.identity import point_digest, run_key
 from sumo_cohesion.errors import InputsChangedError, StorageError
-from sumo_cohesion.planning.registry import make_planner
-from sumo_cohesion.simulation.run import simulate_with_outputs
+from sumo_cohesion.simulation.request import RunRequest
+from sumo_cohesion.simulation.run import simulate
 from sumo_cohesion.simulation.setup import prepare
 from sumo_cohesion.state import EGO
 from sumo_cohesion.tables.rollout import Rollout
@@ -28,10 +28,7 @@ class Job(NamedTuple):
     """One run: its key, what to run, and what to keep where."""
 
     run: str
-    scenario: str
-    planner: str
-    seed: int
-    overrides: dict[str, Any]
+    request: RunRequest
     tables: tuple[str, ...]
     folder: str
 
@@ -48,8 +45,8 @@ def drive(job: Job) -> dict[str, Any]:
         different on this machine.
     """
     start = perf_counter()
-    setup = prepare(job.scenario, job.planner, job.seed, job.overrides)
-    if run_key(point_digest(setup), job.seed) != job.run:
+    setup = prepare(job.request)
+    if run_key(point_digest(setup), job.request.seed) != job.run:
         raise InputsChangedError(
             "scenario, network, planner, code or versions are not those the batch was started "
             "with; run it again, with the same versions on every machine"
@@ -57,8 +54,7 @@ def drive(job: Job) -> dict[str, Any]:
     outputs: list[Output] = [
         kind for kind in ("fcd", "tripinfo", "ssm") if SUMO + kind in job.tables
     ]
-    planner = make_planner(job.planner, setup.settings, setup.cohesion)
-    rollout = simulate_with_outputs(setup, planner, outputs)
+    rollout = simulate(setup, sumo_outputs=outputs)
     for name in job.tables:
         _keep(rollout, name, table_file(Path(job.folder), name, job.run))
     (row,) = rollout.metrics.to_dict(orient="records")

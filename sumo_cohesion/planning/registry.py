@@ -12,7 +12,7 @@ import re
 import sys
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 from sumo_cohesion.errors import UserError
 from sumo_cohesion.planning.cohesive import CohesivePlanner
@@ -38,19 +38,38 @@ def cohesion_of(name: str, cohesion: CohesionSettings) -> CohesionSettings:
     return as_printed(cohesion) if name == "paper" else cohesion
 
 
-def make_planner(name: str, settings: PlannerSettings, cohesion: CohesionSettings) -> Planner:
-    """Make a planner by name: a built-in one, or ``module:Class(...)``.
+AnyPlanner: TypeAlias = "str | type[Planner] | Planner"
+"""A planner's name; its class, made anew for every run; or an object, used as it is."""
+
+
+def planner_name(planner: AnyPlanner) -> str:
+    """Return what tables call a planner."""
+    if isinstance(planner, str):
+        return planner
+    kind = planner if isinstance(planner, type) else type(planner)
+    return f"{kind.__module__}:{kind.__qualname__}"
+
+
+def make_planner(
+    planner: AnyPlanner, settings: PlannerSettings, cohesion: CohesionSettings
+) -> Planner:
+    """Make a planner: a built-in one by name, ``module:Class(...)``, or of its class.
+
+    An object is returned as it is: its ``reset`` has to forget the run before.
 
     Raises
     ------
     UserError
         If there is no such planner.
     """
-    if name == "sumo":
+    if not isinstance(planner, str):
+        name = planner_name(planner)
+        return _checked(_made(planner, {}, name) if isinstance(planner, type) else planner, name)
+    if planner == "sumo":
         return SumoDriver()
-    if name in BUILT_IN:
-        return CohesivePlanner(settings, cohesion_of(name, cohesion))
-    return _load_planner(name)
+    if planner in BUILT_IN:
+        return CohesivePlanner(settings, cohesion_of(planner, cohesion))
+    return _load_planner(planner)
 
 
 @lru_cache(maxsize=32)
@@ -114,13 +133,20 @@ def _load_planner(name: str) -> Planner:
         raise UserError(f"planner {name!r}: cannot import {module_name!r} ({said})") from None
     if not hasattr(module, class_name):
         raise UserError(f"planner {name!r}: {module_name!r} has no {class_name!r}")
+    return _checked(_made(getattr(module, class_name), arguments, name), name)
+
+
+def _made(kind: Any, arguments: dict[str, Any], name: str) -> object:
     try:
-        planner = getattr(module, class_name)(**arguments)
+        return kind(**arguments)
     except (Exception, SystemExit) as error:
         said = f"{type(error).__name__}: {error}"
         raise UserError(
             f"planner {name!r}: the class cannot be called with these arguments ({said})"
         ) from None
+
+
+def _checked(planner: object, name: str) -> Planner:
     if not isinstance(planner, Planner):
         raise UserError(
             f"planner {name!r} needs the methods reset(road) and plan(observation, history)"

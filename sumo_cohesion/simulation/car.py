@@ -1,10 +1,12 @@
-"""One planned car's step: ask its planner, and go where the first control takes it."""
+"""A car that a planner drives: the ego, every car of the fleet and the nominal twin are one."""
 
 from __future__ import annotations
 
 import traceback
 from dataclasses import replace
 from pathlib import Path
+from time import perf_counter
+from typing import NamedTuple
 
 from sumo_cohesion.perception.history import History
 from sumo_cohesion.planning import dynamics
@@ -18,6 +20,49 @@ SHARPEST, HARDEST = 1.0, 100.0
 """Curvature (1/m) and acceleration (m/s²) beyond which a control is not that of a car."""
 END_OF_ROUTE = 20.0
 """Metres before the end of its route up to which a car is planned; SUMO would remove it there."""
+
+
+class Spent(NamedTuple):
+    """Seconds of wall time that one step took a car: to remember what it sees, and to plan."""
+
+    remembering: float = 0.0
+    planning: float = 0.0
+
+
+class PlannedCar:
+    """One car's own memory and planner, along its own road.
+
+    Per step: what it sees (perception.observation.Overview) goes into `step`, which remembers it
+    and returns a plan; `drive` says where the plan's first control takes the car.
+
+    Attributes
+    ----------
+    road : along its route.
+    spent : wall time of the last step.
+    """
+
+    def __init__(
+        self, planner: Planner, road: Road, history: History, settings: PlannerSettings
+    ) -> None:
+        planner.reset(road)
+        self.road = road
+        self.spent = Spent()
+        self._planner = planner
+        self._history = history
+        self._settings = settings
+
+    def step(self, observation: Observation) -> Plan:
+        """Remember what is seen, and plan; never without a plan, whatever the planner does."""
+        t0 = perf_counter()
+        self._history.push(observation)
+        t1 = perf_counter()
+        plan = ask(self._planner, observation, self._history, self.road, self._settings)
+        self.spent = Spent(t1 - t0, perf_counter() - t1)
+        return plan
+
+    def drive(self, state: CartesianState, plan: Plan) -> CartesianState | None:
+        """Where the first planned control takes the car; None if SUMO drives it."""
+        return drive(state, plan, self._settings)
 
 
 def ask(
@@ -67,3 +112,8 @@ def drive(state: CartesianState, plan: Plan, settings: PlannerSettings) -> Carte
     control = Control(curvature, max(acceleration, stop))
     x, y, heading, speed = dynamics.step(state, control, STEP, settings.friction)
     return CartesianState(float(x), float(y), float(heading), max(float(speed), 0.0))
+
+
+def at_end(road: Road, s: float) -> bool:
+    """Tell whether a place (m along the route) is where planning ends."""
+    return s > road.length - END_OF_ROUTE

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from sumo_cohesion.simulation.request import RunRequest
 from sumo_cohesion.simulation.setup import prepare
 from sumo_cohesion.tables.folders import require_replaceable, whole_folder
 
@@ -30,8 +31,8 @@ def export_scenario(
         If the scenario is wrong or the folder holds something else.
     """
     target = Path(folder)
-    require_replaceable(target, CONFIG_FILE)
-    setup = prepare(scenario, "sumo", seed, overrides)
+    require_replaceable(target)
+    setup = prepare(RunRequest(scenario, "sumo", seed, overrides or {}))
     with whole_folder(target) as new:
         setup.write_inputs(new).write_config(new / CONFIG_FILE)
         for path in (setup.network, *setup.additional):

@@ -9,19 +9,15 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Collection
-from dataclasses import dataclass
 from math import hypot
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from sumo_cohesion.perception.history import History
 from sumo_cohesion.perception.observation import Overview
-from sumo_cohesion.planning.planners import Planner
-from sumo_cohesion.planning.registry import make_planner
 from sumo_cohesion.planning.route import check_road
 from sumo_cohesion.road import Road
-from sumo_cohesion.simulation.car import END_OF_ROUTE, ask, drive
+from sumo_cohesion.simulation.car import PlannedCar, at_end
 from sumo_cohesion.social.memory import SharedFeatures, new_history
 from sumo_cohesion.state import EGO, STEP, CartesianState, FloatArray, Scene
 from sumo_cohesion.traffic.contact import contacts
@@ -56,15 +52,6 @@ def is_equipped(vehicle: str, seed: int, penetration: float) -> bool:
     return int.from_bytes(digest) / 2**48 < penetration
 
 
-@dataclass(frozen=True)
-class _Member:
-    """One planned car."""
-
-    road: Road
-    planner: Planner
-    history: History
-
-
 class Fleet:
     """The cars besides the ego that planners drive; empty at a penetration of zero.
 
@@ -78,7 +65,7 @@ class Fleet:
     def __init__(self, setup: Setup) -> None:
         self._setup = setup
         self._sensing = setup.scenario.sensing
-        self._members: dict[str, _Member] = {}
+        self._members: dict[str, PlannedCar] = {}
         self._features = SharedFeatures()
         self._human: set[str] = set(setup.not_human)  # never taken in (again)
         self._were_planned: set[str] = set()
@@ -94,7 +81,7 @@ class Fleet:
         What a car did while it was planned stays remembered, so it is no human's vote later on.
         If egos follow egos, only wrecks are left.
         """
-        return self._touched if self._setup.cohesion.follow_egos else self._were_planned
+        return self._touched if self._setup.cohesion.follow_egos else {EGO, *self._were_planned}
 
     def meet(self, scene: Scene, register: Register) -> None:
         """Hand back who is no longer to be planned, and take in who is now; once per scene."""
@@ -115,37 +102,27 @@ class Fleet:
             if hypot(state[0] - ego.x, state[1] - ego.y) <= reach:
                 self._take_in(name, state, register)
 
-    def drive(self, scene: Scene) -> dict[str, CartesianState]:
+    def drive(self, scene: Scene, overview: Overview) -> dict[str, CartesianState]:
         """Plan every member from what it sees; returns where it is driven in this step.
 
-        Who is missing in the result is left to SUMO.
+        ``overview`` is of the ego's road. Who is missing in the result is left to SUMO.
         """
         if not self._members:
             return {}
-        setup = self._setup
         self._features.next_step()
-        shown = [i for i, name in enumerate(scene.ids) if name not in self._sensing.hidden]
-        ids = (*[scene.ids[i] for i in shown], EGO)
-        states = np.concatenate((scene.states[shown], [scene.ego]))
-        sizes = np.concatenate((scene.sizes[shown], [scene.ego_size]))
-        not_voters = {*self._sensing.special, *self.not_followed}
-        if not setup.cohesion.follow_egos:
-            not_voters.add(EGO)
-        voter = tuple([name not in not_voters for name in ids])
-        row = {name: i for i, name in enumerate(ids)}
-        overviews: dict[int, Overview] = {}
+        not_followed = self.not_followed
+        overviews = {id(overview.road): overview}
+        states = dict(zip(scene.ids, scene.states.tolist(), strict=True))
         driven = {}
-        for name, member in self._members.items():
-            view = overviews.get(id(member.road))
+        for name, car in self._members.items():
+            view = overviews.get(id(car.road))
             if view is None:
-                view = Overview.along(member.road, scene.time, ids, states, sizes, voter)
-                overviews[id(member.road)] = view
-            observation = view.seen_by(row[name], self._sensing.range)
-            member.history.push(observation)
-            plan = ask(member.planner, observation, member.history, member.road, setup.settings)
+                view = self._setup.sensor.survey(scene, car.road, not_followed)
+                overviews[id(car.road)] = view
+            plan = car.step(view.seen_by(name))
             self._failures += plan.fallback
             self._interventions += plan.intervened
-            state = drive(CartesianState(*states[row[name]].tolist()), plan, setup.settings)
+            state = car.drive(CartesianState(*states[name]), plan)
             if state is not None:
                 driven[name] = state
                 self._were_planned.add(name)
@@ -182,12 +159,12 @@ class Fleet:
             return
         if register.has_stop(name):
             return
-        planner = make_planner(setup.planner_name, setup.settings, setup.cohesion)
+        planner, history = setup.make_planner(), new_history(setup.cohesion, STEP, self._features)
         try:
             road = setup.road_along(register.route(name))
             s, *_ = road.project(state[0], state[1])
             check_road(setup.planner_name, setup.settings, road, s, setup.scenario.duration)
-            planner.reset(road)
+            car = PlannedCar(planner, road, history, setup.settings)
         except MemoryError:
             raise
         except Exception as error:  # whatever a network has that this planner cannot drive along
@@ -197,8 +174,7 @@ class Fleet:
         if _at_end(road, state):
             self._human.add(name)
             return
-        history = new_history(setup.cohesion, STEP, self._features)
-        self._members[name] = _Member(road, planner, history)
+        self._members[name] = car
         self._were_planned.add(name)
 
     def _stays_human(self, name: str) -> None:
@@ -208,7 +184,7 @@ class Fleet:
 
 def _at_end(road: Road, state: list[float]) -> bool:
     s, *_ = road.project(state[0], state[1])
-    return s > road.length - END_OF_ROUTE
+    return at_end(road, s)
 
 
 def _near_another(rows: list[int], states: FloatArray, sizes: FloatArray) -> list[int]:

@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
 
-from sumo_cohesion.perception.history import History
-from sumo_cohesion.perception.observation import Sensor
+from sumo_cohesion.errors import SimulationError
 from sumo_cohesion.planning.explanation import Explanation
-from sumo_cohesion.simulation.twin import Reference
+from sumo_cohesion.simulation.episode import Ending, Moment, Seconds
 from sumo_cohesion.state import (
     EGO,
     AgreementRow,
     BoolArray,
     Control,
     FloatArray,
-    Observation,
     Plan,
     RoadState,
     Scene,
@@ -32,74 +30,56 @@ from sumo_cohesion.versions import versions
 if TYPE_CHECKING:
     from sumo_cohesion.simulation.setup import Setup
 
-RUN_FILE = "run.json"
 _NO_CONTROL = Control(float("nan"), float("nan"))
 
 
-class Ending(NamedTuple):
-    """How a run ended.
+class Recorder:
+    """Listens to a run and makes its tables.
 
-    ``touched`` are the vehicles the ego touched, ``touched_by_sumo`` those SUMO reports;
-    ``triggered`` is SUMO's time (s) of each of the scenario's events, by number; ``fleet`` what
-    became of the other planned cars (Fleet.summary).
+    ``reference`` are the rows that a twin notes meanwhile (simulation.twin).
     """
 
-    outcome: str
-    touched: list[str]
-    touched_by_sumo: list[str]
-    triggered: dict[int, float]
-    fleet: dict[str, Any]
-
-
-class Seconds(NamedTuple):
-    """Wall time of one step: the ego's perception and planning, all other planned cars', SUMO's."""
-
-    perception: float
-    plan: float
-    fleet: float
-    sumo: float
-
-
-class Recorder:
-    """Collects the steps of one run and turns them into tables at its end."""
-
-    def __init__(self, setup: Setup, sensor: Sensor) -> None:
+    def __init__(self, setup: Setup, reference: Sequence[dict[str, object]] = ()) -> None:
         self._setup = setup
         self._road = setup.road
-        self._reference = Reference(setup, sensor) if setup.scenario.reference else None
+        self._reference = reference
         self._scenes: list[Scene] = []
         self._visible: list[frozenset[str]] = []
         self._planned: list[frozenset[str]] = []
         self._plans: list[tuple[float, RoadState, Plan]] = []
+        self._horizons: list[FloatArray] = []
         self._seconds: list[Seconds] = []
+        self._ending: Ending | None = None
 
-    def add(
-        self,
-        scene: Scene,
-        observation: Observation,
-        history: History,
-        plan: Plan,
-        others: Collection[str],
-        seconds: Seconds,
-    ) -> None:
-        """Record one step; ``others`` are the vehicles besides the ego that planners drive."""
-        if self._reference is not None:
-            self._reference.add(scene, observation, history, plan)
-        self._scenes.append(self._recorded(scene))
-        self._visible.append(frozenset(observation.ids))
-        self._planned.append(frozenset((*others, EGO) if plan.controls else others))
-        self._plans.append((scene.time, observation.ego, plan))
-        self._seconds.append(seconds)
+    @property
+    def heard(self) -> bool:
+        """Tell whether there is anything to make tables of."""
+        return bool(self._plans) and self._ending is not None
 
-    def finish(self, last: Scene, ending: Ending) -> Rollout:
-        """Build the rollout; ``last`` is the scene after the last step."""
-        setup = self._setup
-        self._scenes.append(self._recorded(last))
+    def on_step(self, moment: Moment) -> None:
+        """Record one step."""
+        plan, others = moment.plan, moment.planned
+        self._scenes.append(self._recorded(moment.scene))
+        self._visible.append(frozenset(moment.observation.ids))
+        self._planned.append(others | {EGO} if plan.controls else others)
+        self._plans.append((moment.scene.time, moment.observation.ego, plan))
+        self._horizons.append(_planned(plan))
+        self._seconds.append(moment.seconds)
+
+    def on_end(self, ending: Ending) -> None:
+        """Record how it ended."""
+        self._ending = ending
+
+    def rollout(self) -> Rollout:
+        """Make the tables of a run that has ended."""
+        setup, ending = self._setup, self._ending
+        if not self.heard or ending is None:
+            raise SimulationError("nothing was recorded: the run has not ended, or had no step")
+        self._scenes.append(self._recorded(ending.scene))
         self._visible.append(self._visible[-1])
         self._planned.append(self._planned[-1])
-        trajectory = self._trajectory(last.ego_size)
-        rows = [] if self._reference is None else self._reference.rows
-        reference = as_table("reference", rows)
+        trajectory = self._trajectory(ending.scene.ego_size)
+        reference = as_table("reference", list(self._reference))
         plan, agreement, timing = self._plan_table(), self._agreement_table(), self._timing_table()
         info = {
             "scenario": setup.scenario.model_dump(mode="json"),
@@ -108,13 +88,13 @@ class Recorder:
             "cohesion": setup.cohesion.model_dump(mode="json"),
             "seed": setup.seed,
             "outcome": ending.outcome,
-            "touched": ending.touched,
-            "touched_by_sumo": ending.touched_by_sumo,
+            "touched": list(ending.touched),
+            "touched_by_sumo": list(ending.touched_by_sumo),
             "events": {str(number): time for number, time in ending.triggered.items()},
             "fleet": ending.fleet,
             "hidden": list(setup.scenario.sensing.hidden),
             "special": list(setup.scenario.sensing.special),
-            "solver": self._plans[0][2].solver if self._plans else "",
+            "solver": self._plans[0][2].solver,
             "n_route_lanes": setup.road.n_route_lanes,
             "traffic_lights": list(setup.traffic_lights),
             "versions": versions(),
@@ -195,7 +175,9 @@ class Recorder:
 
     def _horizon_table(self) -> pd.DataFrame:
         """Where every plan led."""
-        told = [(time, _planned(plan)) for time, _, plan in self._plans]
+        told = [
+            (time, states) for (time, _, _), states in zip(self._plans, self._horizons, strict=True)
+        ]
         counts = [len(states) for _, states in told]
         states = np.concatenate([np.empty((0, 4)), *[states for _, states in told]])
         columns: dict[str, object] = {
@@ -247,9 +229,12 @@ class Recorder:
 
 
 def _planned(plan: Plan) -> FloatArray:
-    """Road states that a plan leads to, (n, 4); a user's planner need not say, or not so."""
+    """Road states that a plan leads to, (n, 4); a user's planner need not say, or not so.
+
+    A copy: a planner may write every plan into the same array.
+    """
     try:
-        states = np.asarray(plan.states, dtype=float)
+        states = np.array(plan.states, dtype=float)
     except (TypeError, ValueError):
         states = np.empty(0)
     return states[1:] if states.ndim == 2 and states.shape[1] == 4 else np.empty((0, 4))

@@ -10,10 +10,19 @@ from pathlib import Path
 from typing import Any
 
 from sumo_cohesion.errors import UserError
-from sumo_cohesion.planning.registry import check_planner, cohesion_of
+from sumo_cohesion.perception.observation import Sensor
+from sumo_cohesion.planning.planners import Planner
+from sumo_cohesion.planning.registry import (
+    AnyPlanner,
+    check_planner,
+    cohesion_of,
+    make_planner,
+    planner_name,
+)
 from sumo_cohesion.planning.route import check_road
 from sumo_cohesion.planning.settings import PlannerSettings
 from sumo_cohesion.road import Road
+from sumo_cohesion.simulation.request import RunRequest
 from sumo_cohesion.simulation.scenario import Scenario, load_scenario
 from sumo_cohesion.social.settings import CohesionSettings
 from sumo_cohesion.traffic.demand import (
@@ -52,6 +61,7 @@ class Setup(Inputs):
     adds to what is written.
     """
 
+    planner: AnyPlanner
     seed: int
     route: tuple[str, ...]
     road: Road
@@ -85,6 +95,16 @@ class Setup(Inputs):
         With a fleet, all that a planned car at the edge of the ego's range senses.
         """
         return self.recorded_radius + (self.scenario.sensing.range if self.penetration else 0.0)
+
+    @property
+    def sensor(self) -> Sensor:
+        """What planned cars can see."""
+        sensing = self.scenario.sensing
+        return Sensor(sensing.range, frozenset(sensing.hidden), frozenset(sensing.special))
+
+    def make_planner(self) -> Planner:
+        """Make a planner for one car."""
+        return make_planner(self.planner, self.settings, self.cohesion)
 
     def road_along(self, route: Sequence[str]) -> Road:
         """Road along any route of this network; raises UserError if no car can drive along it."""
@@ -149,27 +169,25 @@ def _meant(name: str) -> str:
     return f"; settings are planner.*, cohesion.*, and of the scenario {known}"
 
 
-def resolve(scenario: str | Path, planner: str, overrides: Mapping[str, Any]) -> Inputs:
+def resolve(request: RunRequest) -> Inputs:
     """Load and validate the settings and find the files, quickly: nothing is opened yet."""
-    settings, cohesion, scenario_overrides = settings_from(overrides)
-    loaded = load_scenario(scenario, scenario_overrides)
+    settings, cohesion, scenario_overrides = settings_from(request.overrides)
+    loaded, name = (
+        load_scenario(request.scenario, scenario_overrides),
+        planner_name(request.planner),
+    )
     return Inputs(
         scenario=loaded,
-        planner_name=planner,
+        planner_name=name,
         settings=settings,
-        cohesion=cohesion_of(planner, cohesion),
+        cohesion=cohesion_of(name, cohesion),
         network=loaded.file(loaded.network, "networks"),
         routes=tuple(loaded.file(name, "routes") for name in loaded.routes),
         additional=tuple(loaded.file(name, "routes") for name in loaded.additional),
     )
 
 
-def prepare(
-    scenario: str | Path,
-    planner: str = "cohesive",
-    seed: int = 0,
-    overrides: Mapping[str, Any] | None = None,
-) -> Setup:
+def prepare(request: RunRequest) -> Setup:
     """Check everything a run needs before SUMO starts.
 
     Raises
@@ -177,21 +195,34 @@ def prepare(
     UserError
         If the scenario, its network or demand, the planner or a setting is wrong.
     """
+    seed, planner = request.seed, request.planner
     if not 0 <= seed < 2**31:
         raise UserError(f"seed {seed} is out of range; SUMO takes 0 to 2147483647")
-    inputs = resolve(scenario, planner, overrides or {})
+    inputs = resolve(request)
     loaded = inputs.scenario
-    check_planner(planner)
+    if isinstance(planner, str):
+        check_planner(planner)
+    elif not isinstance(planner, type) and loaded.fleet.penetration:
+        raise UserError(
+            "fleet.penetration: every planned car needs a planner of its own; give the planner's "
+            "class or name instead of an object"
+        )
     network = _network(inputs.network, *_version(inputs.network))
     named = {*loaded.sensing.hidden, *loaded.sensing.special}
     for event in loaded.events:
         named |= {*event.who} | ({event.near} if event.near else set())
     check_human_type(loaded.human_type)
-    route = check_demand(network, inputs.routes, loaded.ego, named)
-    road = _road(inputs.network, *_version(inputs.network), tuple(route))
-    check_road(planner, inputs.settings, road, loaded.ego.position, loaded.duration)
-    lights = tuple(network.traffic_lights(route))
-    return Setup(**vars(inputs), seed=seed, route=tuple(route), road=road, traffic_lights=lights)
+    route = tuple(check_demand(network, inputs.routes, loaded.ego, named))
+    road = _road(inputs.network, *_version(inputs.network), route)
+    check_road(inputs.planner_name, inputs.settings, road, loaded.ego.position, loaded.duration)
+    return Setup(
+        **vars(inputs),
+        planner=planner,
+        seed=seed,
+        route=route,
+        road=road,
+        traffic_lights=tuple(network.traffic_lights(route)),
+    )
 
 
 def _version(path: Path) -> tuple[int, int]:

@@ -1,62 +1,179 @@
-"""Folders of results: written whole or not at all, and nothing of a user's is touched."""
+"""Folders of results: written whole or not at all, and nothing of a user's is touched.
+
+A result's folder holds a list of the files that are the result's (`MARKER`). Only these are
+replaced by the next result; whatever else lies beside them stays.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import json
 import shutil
 import tempfile
 from pathlib import Path
+from types import TracebackType
 
 from sumo_cohesion.errors import UserError
 
-
-def require_replaceable(folder: Path, marker: str) -> None:
-    """Raise UserError unless a folder is new, empty, or an earlier result (holds ``marker``)."""
-    if not folder.exists():
-        return
-    if not folder.is_dir() or (any(folder.iterdir()) and not (folder / marker).is_file()):
-        raise UserError(
-            f"{folder}: holds something else than an earlier result; choose another --out"
-        )
+MARKER = ".sumo-cohesion.json"
+"""File that lists, by relative path, which files of a folder are the result's."""
 
 
-def require_writable(folder: Path) -> None:
-    """Raise UserError unless a result can be written to a folder; its parents are made."""
-    _new_sibling(folder).rmdir()
+def require_replaceable(folder: Path) -> None:
+    """Raise UserError unless a result can be written to a folder; its parents are made.
 
-
-def _new_sibling(folder: Path) -> Path:
-    """Make a hidden folder beside one that may not be there yet."""
+    That is one that is not there yet, is empty, or holds an earlier result.
+    """
     try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        return Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
+        holds_other = folder.is_dir() and any(folder.iterdir()) and not (folder / MARKER).is_file()
+        if holds_other or (folder.exists() and not folder.is_dir()):
+            raise UserError(
+                f"{folder}: holds something else than an earlier result; choose another --out"
+            )
+        _new_beside(folder.resolve()).rmdir()
     except OSError as error:
-        raise UserError(
-            f"{folder}: cannot write there ({error.strerror}); choose another --out"
-        ) from None
+        raise _cannot_write(folder, error) from None
 
 
 class whole_folder:  # noqa: N801 - reads as a function where it is used
-    """Context: write into a temporary sibling that replaces ``folder`` only if all went well."""
+    """Context: a new folder to write into, whose files are moved to ``folder`` if all went well.
+
+    They replace those of an earlier result. If a file of somebody else is in the way, or the disk
+    refuses, the new files are kept and the UserError says where.
+    """
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
 
     def __enter__(self) -> Path:
-        self._new = _new_sibling(self._folder)
-        self._new.chmod(0o755)
+        try:
+            self._target = self._folder.resolve()  # a link stays one
+            self._new = _new_beside(self._target)
+            self._new.chmod(0o755)
+        except OSError as error:
+            raise _cannot_write(self._folder, error) from None
         return self._new
 
-    def __exit__(self, kind: type[BaseException] | None, error: object, trace: object) -> None:
-        if kind is None:
-            old = self._new.with_name(self._new.name + "-old")
-            if self._folder.exists():
-                self._folder.rename(old)
-            self._new.rename(self._folder)
-            shutil.rmtree(old, ignore_errors=True)
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if kind is not None:
+            shutil.rmtree(self._new, ignore_errors=True)
+            if isinstance(error, OSError):
+                raise _cannot_write(self._folder, error) from None
             return
-        shutil.rmtree(self._new, ignore_errors=True)
-        if isinstance(error, OSError):
+        try:
+            _list_files(self._new)
+            if self._target.exists():
+                _move_into(self._target, self._new)
+            else:
+                self._new.rename(self._target)
+        except (OSError, UserError) as problem:
+            said = problem.strerror or problem if isinstance(problem, OSError) else problem
+            kept = keep(self._new, self._target)
             raise UserError(
-                f"{self._folder}: cannot write there ({error.strerror or error}); "
-                "free some space or choose another --out"
+                f"{self._folder}: {said}; the new result is kept in {kept}; choose another --out"
             ) from None
+
+
+def keep(new: Path, folder: Path) -> Path:
+    """Move unfinished work to a name beside a folder that nobody has; returns where it is."""
+    for number in range(1, 1000):
+        free = folder.with_name(f"{folder.name}.unfinished" + (f"-{number}" if number > 1 else ""))
+        if not free.exists():
+            with contextlib.suppress(OSError):
+                return new.rename(free)
+    return new
+
+
+def claim(folder: Path, name: str) -> Path:
+    """Return the path of one more file of a result, after noting that it is the result's.
+
+    Raises
+    ------
+    UserError
+        If somebody else's file has this name.
+    """
+    path, files = folder / name, _listed(folder)
+    if name in files:
+        return path
+    if path.exists():
+        raise UserError(f"{path}: is not of this result and stays; name another file with --out")
+    with contextlib.suppress(OSError):  # who may not write here is told so by the caller
+        _write_list(folder, [*files, name])
+    return path
+
+
+def _new_beside(folder: Path) -> Path:
+    """Make a hidden folder from which files can be moved to one that may not be there yet."""
+    if folder.is_dir():
+        return Path(tempfile.mkdtemp(prefix=".new-", dir=folder))
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    return Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
+
+
+def _listed(folder: Path) -> list[str]:
+    """Files of the result that a folder holds; none if it holds none."""
+    try:
+        files = [Path(name) for name in json.loads((folder / MARKER).read_text("utf-8"))["files"]]
+    except (OSError, ValueError, KeyError, TypeError):
+        return []
+    return [p.as_posix() for p in files if not p.is_absolute() and ".." not in p.parts]
+
+
+def _list_files(folder: Path) -> None:
+    _write_list(
+        folder, [p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file()]
+    )
+
+
+def _write_list(folder: Path, files: list[str]) -> None:
+    text = json.dumps({"files": sorted(set(files))}, indent=1, ensure_ascii=False)
+    (folder / MARKER).write_text(text + "\n", encoding="utf-8")
+
+
+def _move_into(folder: Path, new: Path) -> None:
+    """Replace the files of a folder's earlier result by those of the new one."""
+    earlier, files = [*_listed(folder), MARKER], [*_listed(new), MARKER]
+    for name in files:
+        if (folder / name).exists() and name not in earlier:
+            raise UserError(f"{name} there is not of an earlier result and would be overwritten")
+    old = Path(tempfile.mkdtemp(prefix=".old-", dir=folder))
+    moved: list[tuple[Path, Path]] = []
+    try:
+        # The list goes first and comes last: without it there is no result.
+        for source, target, names in ((folder, old, reversed(earlier)), (new, folder, files)):
+            for name in names:
+                if (source / name).exists():
+                    (target / name).parent.mkdir(parents=True, exist_ok=True)
+                    moved.append((source / name, (target / name)))
+                    (source / name).rename(target / name)
+    except OSError:
+        for source_file, target_file in reversed(moved):
+            with contextlib.suppress(OSError):
+                target_file.rename(source_file)
+        raise
+    finally:
+        shutil.rmtree(old, ignore_errors=True)
+    shutil.rmtree(new, ignore_errors=True)
+    _remove_emptied(folder, earlier)
+
+
+def _remove_emptied(folder: Path, names: list[str]) -> None:
+    """Remove the folders of files that have gone, as far as nothing else is in them."""
+    for name in names:
+        for parent in (folder / name).parents:
+            if parent == folder:
+                break
+            with contextlib.suppress(OSError):  # not empty
+                parent.rmdir()
+
+
+def _cannot_write(folder: Path, error: OSError) -> UserError:
+    return UserError(
+        f"{folder}: cannot write there ({error.strerror or error}); free some space or choose "
+        "another --out"
+    )

@@ -41,7 +41,7 @@ class Rollout:
 
     def write(self, folder: Path) -> Path:
         """Write run.json and one parquet file per table, all of them or none."""
-        require_replaceable(folder, RUN_FILE)
+        require_replaceable(folder)
         with whole_folder(folder) as new:
             for name in TABLES:
                 getattr(self, name).to_parquet(new / f"{name}.parquet", index=False)

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sumo_cohesion.errors import SimulationError, UserError
+from sumo_cohesion.errors import SimulationError, StoppedError, UserError
 from sumo_cohesion.state import EGO, STEP, CartesianState, Scene
 from sumo_cohesion.traffic.contact import contacts
 from sumo_cohesion.traffic.library import captured_stderr, first_error, load_libsumo, load_window
@@ -100,7 +100,7 @@ class Simulator:
     Raises
     ------
     UserError
-        If SUMO rejects the network or the demand.
+        If SUMO rejects the network or the demand; StoppedError if it does so later on.
     SimulationError
         If a car is not where it was put, or the ego has gone.
     """
@@ -162,7 +162,7 @@ class Simulator:
         for _ in range(10):
             if self._stepped:
                 return
-            with contextlib.suppress(SimulationError):
+            with contextlib.suppress(StoppedError):
                 self._step()
                 return
             # What SUMO stumbles over is what it is about to insert.
@@ -180,11 +180,7 @@ class Simulator:
                     f"SUMO has not inserted the ego by {latest:g} s; its start is blocked, "
                     "choose another ego.position, ego.lane or ego.depart"
                 )
-            try:
-                self._step()
-            except SimulationError as error:
-                # What stops SUMO before the ego has departed is in the user's files.
-                raise UserError(f"{error}; mend the demand") from None
+            self._step()
         self._sumo.vehicle.subscribeContext(
             EGO, self._sumo.constants.CMD_GET_VEHICLE_VARIABLE, self._radius, self._variables
         )
@@ -356,7 +352,10 @@ class Simulator:
         try:
             self._sumo.simulationStep()
         except Exception as error:
-            raise SimulationError(f"SUMO stopped: {error}") from None
+            # What stops SUMO is in the user's files: it meets a vehicle when that departs.
+            at = float(self._sumo.simulation.getTime())
+            why = str(error).rstrip(". ")
+            raise StoppedError(f"SUMO stopped at {at:g} s: {why}; mend the demand") from None
         self._stepped = True
 
     def _size(self, name: str) -> tuple[float, float]:

@@ -16,9 +16,11 @@ import pandas as pd
 import pytest
 
 from sumo_cohesion import run
-from sumo_cohesion.errors import SimulationError, UserError
+from sumo_cohesion.errors import SimulationError, StoppedError, UserError
+from sumo_cohesion.simulation.request import RunRequest
 from sumo_cohesion.simulation.setup import prepare
 from sumo_cohesion.state import CartesianState, Scene
+from sumo_cohesion.tables.folders import MARKER
 from sumo_cohesion.traffic.contact import contacts
 from sumo_cohesion.traffic.simulator import Simulator, SumoRun
 from tests.conftest import NETWORKS, ROOT
@@ -245,7 +247,7 @@ def test_a_step_that_fails_with_a_move_pending_does_not_crash_the_next_run(tmp_p
     for _ in range(3):
         with (  # noqa: PT012 - what raises is the step at which SUMO inserts the bad vehicle
             simulation(tmp_path, vehicle("ego", 1, 100, 25), bad) as sumo,
-            pytest.raises(SimulationError, match="departLane definition for vehicle 'late'"),
+            pytest.raises(StoppedError, match="departLane definition for vehicle 'late'"),
         ):
             ego = sumo.insert_ego(latest=5.0).ego
             for _ in range(20):
@@ -353,9 +355,8 @@ def test_export_opens_in_plain_sumo(tmp_path: Path) -> None:
     from sumo_cohesion.simulation.export import export_scenario
 
     config = export_scenario("stalled", tmp_path / "out", seed=3)
-    assert {p.name for p in config.parent.iterdir()} == {
-        "scenario.sumocfg", "demand.rou.xml", "highway.net.xml",
-    }  # fmt: skip
+    names = {path.name for path in config.parent.iterdir()}
+    assert names == {"scenario.sumocfg", "demand.rou.xml", "highway.net.xml", MARKER}
     sumo = Path(sys.executable).parent / "sumo"
     if not sumo.exists():
         pytest.skip("SUMO's programs are in the extra [gui]")
@@ -372,7 +373,7 @@ def test_export_opens_in_plain_sumo(tmp_path: Path) -> None:
 def test_demand_varies_with_the_seed_as_the_scenario_says(tmp_path: Path) -> None:
     counts, gaps, speeds, stalls = set(), [], [], []
     for seed in range(60):
-        setup = prepare("stalled", "sumo", seed)
+        setup = prepare(RunRequest("stalled", "sumo", seed))
         setup.write_inputs(tmp_path)
         vehicles = {v.get("id"): v for v in ET.parse(tmp_path / "demand.rou.xml").iter("vehicle")}
         humans = {k: v for k, v in vehicles.items() if k not in ("ego", "stalled")}

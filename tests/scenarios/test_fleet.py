@@ -13,6 +13,7 @@ from sumo_cohesion import Rollout, run
 from sumo_cohesion.perception.history import History
 from sumo_cohesion.road import Road
 from sumo_cohesion.simulation.fleet import is_equipped
+from sumo_cohesion.simulation.request import RunRequest
 from sumo_cohesion.simulation.setup import prepare
 from sumo_cohesion.state import Control, Observation, Plan
 
@@ -293,7 +294,7 @@ def test_stops_and_ends_of_routes_are_for_sumo(write: Write) -> None:
 def test_every_member_drives_its_own_way() -> None:
     """At the exit, the ego's way goes on; the humans' leads to the ramp, planned or not."""
     rollout = run("exit", "nominal", 1000, overrides={"duration": 20.0, **ALL})
-    ramp = prepare("exit", "nominal", 1000).road_along(("before", "ramp"))
+    ramp = prepare(RunRequest("exit", "nominal", 1000)).road_along(("before", "ramp"))
     lead = one(rollout, "lead_3")
     lead = lead[lead["planned"]]
     states, _ = ramp.to_frenet(lead[["x", "y", "heading", "speed"]].to_numpy())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
@@ -9,13 +10,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sumo_cohesion.perception.observation import Overview, Sensor
+from sumo_cohesion.perception.observation import Sensor
 from sumo_cohesion.road import Road
 from sumo_cohesion.simulation.fleet import Fleet, _near_another, is_equipped
+from sumo_cohesion.simulation.request import RunRequest
 from sumo_cohesion.simulation.setup import prepare
 from sumo_cohesion.social.features import social_features
 from sumo_cohesion.social.memory import SharedFeatures
-from sumo_cohesion.state import CartesianState, Observation, Scene
+from sumo_cohesion.state import CartesianState, Scene
 from sumo_cohesion.traffic.contact import contacts
 
 SHARE = st.floats(0.0, 1.0)
@@ -50,34 +52,65 @@ def crowd(n: int) -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:
     return tuple(f"c{i}" for i in range(n)), np.hstack((places, motion)), sizes
 
 
-def test_what_one_of_many_sees_is_what_a_sensor_sees(highway: Road, curve: Road) -> None:
-    ids, states, sizes = crowd(40)
-    voter = tuple(i % 3 > 0 for i in range(40))
-    special = {name for name, votes in zip(ids, voter, strict=True) if not votes}
+def scene_of(n: int) -> Scene:
+    """The ego among n others."""
+    ids, states, sizes = crowd(n)
+    return Scene(3.0, CartesianState(200.0, -5.0, 0.02, 21.0), (5.0, 1.8), ids, states, sizes)
+
+
+def test_what_each_sees_is_who_is_near_and_not_hidden(highway: Road, curve: Road) -> None:
+    """Of ego and others alike: against the definition, car by car."""
+    scene = scene_of(40)
+    sensor = Sensor(100.0, hidden={"c3", "c8", "c11"}, special={"c1", "c2"})
+    names = (*scene.ids, "ego")
+    states = np.vstack((scene.states, scene.ego))
+    sizes = np.vstack((scene.sizes, scene.ego_size))
     for road in (highway, curve):
-        overview = Overview.along(road, 3.0, ids, states, sizes, voter)
-        for i in range(40):
-            rest = np.arange(40) != i
-            length, width = sizes[i].tolist()
-            scene = Scene(
-                time=3.0,
-                ego=CartesianState(*states[i].tolist()),
-                ego_size=(length, width),
-                ids=tuple(name for j, name in enumerate(ids) if j != i),
-                states=states[rest],
-                sizes=sizes[rest],
-            )
-            expected = Sensor(road, 100.0, special=special).observe(scene)
-            assert_same(overview.seen_by(i, 100.0), expected)
-            also = Sensor(road, 100.0).observe(scene, not_followed=special)
-            assert_same(also, expected)
+        overview = sensor.survey(scene, road, not_followed={"c5"})
+        frenet, bends = road.to_frenet(states)
+        for i, name in enumerate(names):
+            if name in sensor.hidden:
+                continue
+            seen = overview.seen_by(name)
+            apart = np.linalg.norm(states[:, :2] - states[i, :2], axis=1)
+            rows = [
+                j
+                for j, other in enumerate(names)
+                if j != i and apart[j] <= 100.0 and other not in sensor.hidden
+            ]
+            assert seen.ids == tuple(names[j] for j in rows)
+            assert np.array_equal(seen.states, frenet[rows])
+            assert np.array_equal(seen.sizes, sizes[rows])
+            assert np.array_equal(seen.curvature, bends[rows])
+            assert tuple(seen.ego) == tuple(frenet[i])
+            assert seen.ego_size == tuple(sizes[i])
+            voters = [names[j] for j in rows if names[j] not in ("c1", "c2", "c5")]
+            assert [n for n, v in zip(seen.ids, seen.voter, strict=True) if v] == voters
 
 
-def assert_same(a: Observation, b: Observation) -> None:
+def test_a_ghost_sees_what_the_ego_would_see_in_its_place(highway: Road) -> None:
+    scene = scene_of(40)
+    elsewhere = CartesianState(260.0, -8.0, -0.01, 12.0)
+    sensor = Sensor(80.0)
+    ghost = sensor.survey(scene, highway).seen_from(elsewhere)
+    there = sensor.survey(replace(scene, ego=elsewhere), highway).seen_by("ego")
     for name in ("states", "sizes", "curvature"):
-        assert np.array_equal(getattr(a, name), getattr(b, name))
+        assert np.array_equal(getattr(ghost, name), getattr(there, name))
     for name in ("time", "ego", "ego_size", "ids", "voter"):
-        assert getattr(a, name) == getattr(b, name)
+        assert getattr(ghost, name) == getattr(there, name)
+
+
+def test_what_is_shared_cannot_be_written_to(highway: Road) -> None:
+    """One planner's slip must not reach the other runs of its process, nor the record."""
+    scene = scene_of(4)
+    seen = Sensor(400.0).survey(scene, highway).seen_by("ego")
+    shared = [scene.states, scene.sizes, seen.states, seen.sizes, seen.curvature]
+    shared += [highway.x, highway.y, highway.tangent_x, highway.tangent_y, highway.curvature]
+    shared += [highway.lane_centre, highway.lane_width, highway.speed_limit]
+    shared += [*highway.ahead(100.0, 0.0, 2.5, 11)]
+    for array in shared:
+        with pytest.raises(ValueError, match="read-only"):
+            array *= 0.9
 
 
 def test_the_quick_look_misses_no_contact() -> None:
@@ -117,7 +150,9 @@ class Vehicles:
 
 def test_who_cannot_be_planned_stays_human() -> None:
     overrides = {"fleet.penetration": 1.0}
-    fleet = Fleet(prepare("stalled", "tests.scenarios.test_fleet:Straight", 0, overrides))
+    request = RunRequest("stalled", "tests.scenarios.test_fleet:Straight", 0, overrides)
+    setup = prepare(request)
+    fleet = Fleet(setup)
     ids = ("way", "nowhere", "stops", "stalled")
     states = np.array([[100.0 + 20.0 * i, -8.75, 0.0, 20.0] for i in range(4)])
     scene = Scene(
@@ -125,6 +160,7 @@ def test_who_cannot_be_planned_stays_human() -> None:
     )
     for _ in range(3):
         fleet.meet(scene, Vehicles())
-        assert set(fleet.drive(scene)) == {"way"}
+        overview = setup.sensor.survey(scene, setup.road, fleet.not_followed)
+        assert set(fleet.drive(scene, overview)) == {"way"}
     assert list(fleet.summary()["without_road"]) == ["nowhere"]
     assert "gone" in fleet.summary()["without_road"]["nowhere"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from math import atan2, hypot
 
 import casadi as ca
@@ -167,8 +168,9 @@ def test_special_and_oncoming_vehicles_do_not_vote(highway: Road) -> None:
     for k in range(10):
         cars = {"ambulance": (300 + 3.0 * k, 0.0, 30.0), "oncoming": (315 - 3.0 * k, 2.0, 30.0)}
         observation = observe(0.1 * k, cars, special="ambulance")
-        observation.states[1, 2] = np.pi
-        h.push(observation)
+        states = observation.states.copy()
+        states[1, 2] = np.pi
+        h.push(replace(observation, states=states))
     votes = group_votes(RoadState(300.0, 0.0, 0.0, 25.0), h, highway, SETTINGS)
     assert votes == {"position": [], "lane": [], "road": []}
 
