@@ -25,8 +25,9 @@ import pandas as pd
 from sumo_cohesion.batches.batch import Progress, batch
 from sumo_cohesion.batches.results import with_nominal_deviation
 from sumo_cohesion.errors import SimulationError, UserError
-from sumo_cohesion.tables.columns import METRICS, as_table
+from sumo_cohesion.tables.columns import as_table
 from sumo_cohesion.tables.intervals import wilson
+from sumo_cohesion.tables.metrics import METRICS
 from sumo_cohesion.user_input import parse_seeds
 from sumo_cohesion.versions import versions
 

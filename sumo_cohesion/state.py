@@ -20,6 +20,10 @@ STEP = 0.1
 """Seconds per step, of SUMO and of every planner."""
 EGO = "ego"
 """Id of the ego vehicle, in SUMO and in all tables."""
+LANE_WIDTH = 3.5
+"""Metres of a lane where none is at hand: what is measured in lanes is measured in these."""
+STOPPED = "stopped"
+"""Outcome of a run that SUMO stopped."""
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]

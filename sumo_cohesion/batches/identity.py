@@ -9,22 +9,21 @@ import json
 import sys
 from functools import lru_cache
 from pathlib import Path
+from types import CodeType
 
 import sumo_cohesion
 from sumo_cohesion.planning.registry import BUILT_IN, WITHOUT_COHESION, parse_planner
+from sumo_cohesion.planning.solvers import SOLVERS
 from sumo_cohesion.simulation.setup import Inputs
 from sumo_cohesion.versions import versions
 
-_ROOMS = (
-    "traffic",
-    "perception",
-    "social",
-    "planning",
-    "planning/solvers",
-    "simulation",
-    "tables",
+_WALK = (
+    "simulation.run",
+    *[f"planning.solvers.{how.partition(':')[0]}" for how in SOLVERS.values()],
 )
-"""The package's rooms whose code decides results, beside the shared modules."""
+"""Modules that a run begins with; what they import, directly or not, decides its result."""
+_KEEPING = ("tables.rollout", "tables.folders")
+"""Of these, those that only say how a result is kept."""
 
 
 def point_digest(inputs: Inputs) -> str:
@@ -56,14 +55,54 @@ def run_key(point: str, seed: int) -> str:
 
 @lru_cache(maxsize=1)
 def code_digest() -> str:
-    """Digest of the code that decides results, and of the versions it stands on."""
-    package = Path(sumo_cohesion.__file__).parent
-    paths = [*package.glob("*.py"), *(p for room in _ROOMS for p in (package / room).glob("*.py"))]
+    """Digest of the code that decides results, and of the versions it stands on.
+
+    Comments, docstrings and layout do not count.
+    """
     digest = hashlib.sha256()
-    for path in sorted(p for p in paths if p.stem not in ("cli", "__main__")):
-        digest.update(path.relative_to(package).as_posix().encode() + b"\0" + path.read_bytes())
+    for name, path in sorted(code_of_a_run().items()):
+        parts = [(c.co_code, _values(c), c.co_names, c.co_varnames) for c in _compiled(path)]
+        digest.update(f"{name} {parts}".encode())
     digest.update(json.dumps(versions(), sort_keys=True).encode())
     return digest.hexdigest()
+
+
+def code_of_a_run() -> dict[str, Path]:
+    """Return the modules of this package that can change a row, and their files."""
+    package = Path(sumo_cohesion.__file__).parent
+    found: dict[str, Path] = {}
+    left = list(_WALK)
+    while left:
+        name = left.pop()
+        path = package.joinpath(*name.split("."))
+        path = path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
+        if name in found or name in _KEEPING or not path.is_file():
+            continue
+        found[name] = path
+        for names in (code.co_names for code in _compiled(path)):
+            for module in names:
+                if module.startswith("sumo_cohesion."):
+                    own = module.removeprefix("sumo_cohesion.")
+                    left += [own, *(f"{own}.{imported}" for imported in names)]
+    return found
+
+
+@lru_cache(maxsize=256)
+def _compiled(path: Path) -> list[CodeType]:
+    """Compile a module and whatever is defined in it; without docstrings and assertions."""
+    found = [compile(path.read_bytes(), path.name, "exec", dont_inherit=True, optimize=2)]
+    for code in found:
+        found += [value for value in code.co_consts if isinstance(value, CodeType)]
+    return found
+
+
+def _values(code: CodeType) -> list[object]:
+    """Return the constants of a piece of code; sets in an order of their own."""
+    return [
+        sorted(map(repr, value)) if isinstance(value, frozenset) else value
+        for value in code.co_consts
+        if not isinstance(value, CodeType)
+    ]
 
 
 def file_digest(path: Path) -> str:

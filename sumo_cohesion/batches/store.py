@@ -28,7 +28,8 @@ import pandas as pd
 from sumo_cohesion.batches.job import table_file
 from sumo_cohesion.errors import StorageError, UserError
 from sumo_cohesion.locks import alone
-from sumo_cohesion.tables.columns import BATCH, METRICS
+from sumo_cohesion.tables.columns import BATCH
+from sumo_cohesion.tables.metrics import METRICS
 
 MANIFEST = "manifest.json"
 FORMAT = 1

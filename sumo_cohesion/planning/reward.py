@@ -1,14 +1,18 @@
 """The reward terms phi of one planned state and control (paper, section II-B).
 
-Each is a function of CasADi symbols; `terms` names them, and their weights theta carry the same
-names in RewardWeights.
+Each is a function of CasADi symbols, declared with its weight theta in RewardWeights.
 """
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Annotated, Any, NamedTuple
 
 import casadi as ca
+from pydantic import BaseModel, ConfigDict, Field
+
+NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
 LANE_SIGMA = 0.25
 """Standard deviation of a lane's Gaussian, as a share of the lane's width."""
@@ -52,55 +56,144 @@ def in_frames(s: Any, d: Any, cars: Any) -> tuple[Any, Any]:
     return ((ds * cos + dd * sin) / half_length).T, ((dd * cos - ds * sin) / half_width).T
 
 
-def terms(state: Any, control: Any, inputs: StageInputs, ego_width: Any) -> dict[str, Any]:
-    """Reward terms by name, unweighted; costs are negative."""
-    right, left = _beyond_edges(state[1], inputs, ego_width)
-    return {
-        # One Gaussian per lane. It saturates: far from every centre nothing pulls, so that the
-        # car may cross a line when it has a reason to.
-        "lane": ca.sum1(ca.exp(-0.5 * _lanes(state[1], inputs) ** 2)),
-        # Square of how far the ego's side is beyond the margin to either edge.
-        "edge": -(ca.fmax(right, 0) ** 2 + ca.fmax(left, 0) ** 2),
-        "speed": -((state[3] - inputs.speed_limit) ** 2),
-        # One oriented Gaussian per car, as long and as wide as the two cars together.
-        "car": -ca.sum1(ca.exp(-0.5 * _cars(inputs))),
-        "curvature": -(control[0] ** 2),
-        "acceleration": -(control[1] ** 2),
-    }
+class Point(NamedTuple):
+    """One planned stage: where it leads, what controls it, and what is around; symbols.
 
-
-def squares(
-    state: Any, control: Any, inputs: StageInputs, ego_width: Any
-) -> dict[str, list[tuple[Any, Any]]]:
-    """Return the same terms as pairs of residual r and weight w >= 0, both columns.
-
-    The gradient of a term's cost is J'(w r), J the residuals' Jacobian; J'diag(w)J stands for its
-    Hessian and is never negative, as the Hessian of a Gaussian is far from its centre.
+    Attributes
+    ----------
+    state : s, d (m), heading (rad), speed (m/s) in the road's frame.
+    control : curvature (1/m), acceleration (m/s²).
+    inputs, ego_width : see StageInputs; m.
     """
-    right, left = _beyond_edges(state[1], inputs, ego_width)
-    lanes = _lanes(state[1], inputs)
-    near = ca.exp(-0.25 * _cars(inputs))
-    return {
-        "lane": [(lanes, ca.exp(-0.5 * lanes**2))],
-        "edge": [(right, 2.0 * (right > 0)), (left, 2.0 * (left > 0))],
-        "speed": [(state[3] - inputs.speed_limit, 2.0)],
-        "car": [(near, 2.0 * ca.DM.ones(near.shape[0]))],
-        "curvature": [(control[0], 2.0)],
-        "acceleration": [(control[1], 2.0)],
-    }
+
+    state: Any
+    control: Any
+    inputs: StageInputs
+    ego_width: Any
 
 
-def _lanes(d: Any, inputs: StageInputs) -> Any:
+@dataclass(frozen=True)
+class Term:
+    """How one reward term phi is worked out.
+
+    Attributes
+    ----------
+    value : the term; a cost is negative.
+    squares : the same as pairs of residual r and weight w >= 0, both columns. The gradient of the
+        term's cost is J'(w r), J the residuals' Jacobian; J'diag(w)J stands for its Hessian and is
+        never negative, as the Hessian of a Gaussian is far from its centre.
+    """
+
+    value: Callable[[Point], Any]
+    squares: Callable[[Point], list[tuple[Any, Any]]]
+
+
+def _lane(at: Point) -> Any:
+    """One Gaussian per lane.
+
+    It saturates: far from every centre nothing pulls, so that the car may cross a line when it has
+    a reason to.
+    """
+    return ca.sum1(ca.exp(-0.5 * _lanes(at) ** 2))
+
+
+def _lane_squares(at: Point) -> list[tuple[Any, Any]]:
+    lanes = _lanes(at)
+    return [(lanes, ca.exp(-0.5 * lanes**2))]
+
+
+def _edge(at: Point) -> Any:
+    """Square of how far the ego's side is beyond the margin to either edge."""
+    right, left = _beyond_edges(at)
+    return -(ca.fmax(right, 0) ** 2 + ca.fmax(left, 0) ** 2)
+
+
+def _edge_squares(at: Point) -> list[tuple[Any, Any]]:
+    right, left = _beyond_edges(at)
+    return [(right, 2.0 * (right > 0)), (left, 2.0 * (left > 0))]
+
+
+def _speed(at: Point) -> Any:
+    return -((at.state[3] - at.inputs.speed_limit) ** 2)
+
+
+def _speed_squares(at: Point) -> list[tuple[Any, Any]]:
+    return [(at.state[3] - at.inputs.speed_limit, 2.0)]
+
+
+def _car(at: Point) -> Any:
+    """One oriented Gaussian per car, as long and as wide as the two cars together."""
+    return -ca.sum1(ca.exp(-0.5 * _cars(at)))
+
+
+def _car_squares(at: Point) -> list[tuple[Any, Any]]:
+    near = ca.exp(-0.25 * _cars(at))
+    return [(near, 2.0 * ca.DM.ones(near.shape[0]))]
+
+
+def _square_of(i: int) -> Term:
+    """Cost of a control: its square."""
+    return Term(lambda at: -(at.control[i] ** 2), lambda at: [(at.control[i], 2.0)])
+
+
+class RewardWeights(BaseModel):
+    """Weights theta of the reward terms phi (paper, eq. 1); each term says its own unit.
+
+    A term is one field: its name, how it is worked out, and its weight.
+
+    Attributes
+    ----------
+    lane : per lane, reward at its centre.
+    edge : per m², cost beyond the margin at the road's edges.
+    speed : per (m/s)², cost of missing the speed limit.
+    car : cost at the centre of another car.
+    curvature, acceleration : per (1/m)² and (m/s²)², cost of control.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    lane: Annotated[NonNegative, Term(_lane, _lane_squares)] = 1.0
+    edge: Annotated[NonNegative, Term(_edge, _edge_squares)] = 500.0
+    speed: Annotated[NonNegative, Term(_speed, _speed_squares)] = 0.037
+    car: Annotated[NonNegative, Term(_car, _car_squares)] = 100.0
+    curvature: Annotated[NonNegative, _square_of(0)] = 80.0
+    acceleration: Annotated[NonNegative, _square_of(1)] = 1.2e-4
+
+    @property
+    def theta(self) -> tuple[float, ...]:
+        """The weights as a vector, in the order of the fields."""
+        return tuple([getattr(self, name) for name in type(self).model_fields])
+
+
+_TERMS = {
+    name: next(part for part in field.metadata if isinstance(part, Term))
+    for name, field in RewardWeights.model_fields.items()
+}
+TERMS = (*_TERMS, "cohesion", "constraints")
+"""Names of the parts of a stage's reward."""
+
+
+def terms(at: Point) -> dict[str, Any]:
+    """Reward terms by name, unweighted; costs are negative."""
+    return {name: term.value(at) for name, term in _TERMS.items()}
+
+
+def squares(at: Point) -> dict[str, list[tuple[Any, Any]]]:
+    """Return the same terms as weighted squares, see Term."""
+    return {name: term.squares(at) for name, term in _TERMS.items()}
+
+
+def _lanes(at: Point) -> Any:
     """Distance to every lane's centre, in standard deviations of its Gaussian."""
-    return (d - inputs.lanes) / (LANE_SIGMA * inputs.lane_widths)
+    return (at.state[1] - at.inputs.lanes) / (LANE_SIGMA * at.inputs.lane_widths)
 
 
-def _beyond_edges(d: Any, inputs: StageInputs, ego_width: Any) -> tuple[Any, Any]:
+def _beyond_edges(at: Point) -> tuple[Any, Any]:
     """Metres that the ego's side is beyond the margin to the right and to the left edge."""
-    reach = ego_width / 2 + EDGE_MARGIN
-    return inputs.right + reach - d, d + reach - inputs.left
+    reach, d = at.ego_width / 2 + EDGE_MARGIN, at.state[1]
+    return at.inputs.right + reach - d, d + reach - at.inputs.left
 
 
-def _cars(inputs: StageInputs) -> Any:
+def _cars(at: Point) -> Any:
     """Squared distance to every car, in its half length along and CAR_SIGMA_LATERAL across."""
-    return inputs.along**2 + (inputs.across / CAR_SIGMA_LATERAL) ** 2
+    return at.inputs.along**2 + (at.inputs.across / CAR_SIGMA_LATERAL) ** 2

@@ -6,37 +6,11 @@ from typing import Annotated
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
+from sumo_cohesion.planning.reward import RewardWeights
 from sumo_cohesion.planning.solvers import SOLVERS
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-
-
-class RewardWeights(BaseModel):
-    """Weights theta of the reward terms phi (paper, eq. 1); each term says its own unit.
-
-    Attributes
-    ----------
-    lane : per lane, reward at its centre.
-    edge : per m², cost beyond the margin at the road's edges.
-    speed : per (m/s)², cost of missing the speed limit.
-    car : cost at the centre of another car.
-    curvature, acceleration : per (1/m)² and (m/s²)², cost of control.
-    """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    lane: NonNegative = 1.0
-    edge: NonNegative = 500.0
-    speed: NonNegative = 0.037
-    car: NonNegative = 100.0
-    curvature: NonNegative = 80.0
-    acceleration: NonNegative = 1.2e-4
-
-    @property
-    def theta(self) -> tuple[float, ...]:
-        """The weights as a vector, in the order of the fields."""
-        return tuple([getattr(self, name) for name in type(self).model_fields])
 
 
 def _known(solver: str) -> str:

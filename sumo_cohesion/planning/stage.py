@@ -12,7 +12,8 @@ import casadi as ca
 import numpy as np
 
 from sumo_cohesion.planning import constraints, dynamics, reward
-from sumo_cohesion.planning.settings import PlannerSettings, RewardWeights
+from sumo_cohesion.planning.reward import Point, RewardWeights
+from sumo_cohesion.planning.settings import PlannerSettings
 from sumo_cohesion.social.features import FEATURES, social_features
 from sumo_cohesion.state import STEP
 
@@ -22,8 +23,6 @@ CONTROL_SCALE = np.array(SCALES)
 N_STATES = 6
 UNLIMITED = 1e6
 """Change of a scaled control that no bound stands against."""
-TERMS = (*RewardWeights.model_fields, "cohesion", "constraints")
-"""Names of the parts of a stage's reward."""
 
 
 class Stage(NamedTuple):
@@ -122,7 +121,8 @@ def make_stage(settings: PlannerSettings, parameters: StageParameters) -> Stage:
         half_widths=cars[5, :].T,
     )
     # Original reward, eq. 1.
-    own = reward.terms(after, physical, inputs, p["ego_width"])
+    at = Point(after, physical, inputs, p["ego_width"])
+    own = reward.terms(at)
     theta = dict(zip(RewardWeights.model_fields, ca.vertsplit(p["theta"]), strict=True))
     terms = {name: theta[name] * own[name] for name in RewardWeights.model_fields}
     # Cohesion, eq. 2: distance of the ego's social features from the groups' means.
@@ -131,7 +131,7 @@ def make_stage(settings: PlannerSettings, parameters: StageParameters) -> Stage:
     terms["cohesion"] = -ca.dot(p["cohesion_weight"], missed**2) - p["place_weight"] * aside**2
     violation = constraints.violations(after, inputs, p["ego_width"])
     terms["constraints"] = -p["constraint_weight"] * ca.sum1(constraints.penalties(violation))
-    rows = reward.squares(after, physical, inputs, p["ego_width"])
+    rows = reward.squares(at)
     pairs = [(r, theta[name] * w) for name in rows for r, w in rows[name]]
     pairs.append((violation, p["constraint_weight"] * constraints.penalty_weights(violation)))
     pairs += [(missed, 2.0 * p["cohesion_weight"]), (aside, 2.0 * p["place_weight"])]
@@ -191,7 +191,7 @@ def limited_stage(stage: Stage, settings: PlannerSettings) -> Any:
     low, high, change = ca.SX.sym("low", 2), ca.SX.sym("high", 2), ca.SX.sym("change", 2)
     lowest, highest = control_limits(stage.state, low, high, change, settings)
     control = ca.fmin(ca.fmax(stage.control, lowest), highest)
-    (terms,) = stage.landed(ca.vertcat(*[stage.terms[name] for name in TERMS]))
+    (terms,) = stage.landed(ca.vertcat(*[stage.terms[name] for name in reward.TERMS]))
     after = ca.substitute([stage.next_state, terms], [stage.control], [control])
     return ca.Function(
         "stage",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import cycle
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -364,7 +365,7 @@ def precision(rollout: Rollout, group: str = "road") -> pd.DataFrame:
     """
     rows = rollout.agreement[rollout.agreement["group"] == group]
     table = rows.pivot(index="time", columns="feature", values="precision")
-    return table[[name for name in FEATURE_LABELS if name in table]]
+    return table[[name for name in rollout.info["features"] if name in table and name != "place"]]
 
 
 def draw_common_feature(nominal: Rollout, cohesive: Rollout, group: str = "road") -> Figure:
@@ -372,9 +373,8 @@ def draw_common_feature(nominal: Rollout, cohesive: Rollout, group: str = "road"
     figure = drawing.new_figure(WIDTH, 4.8)
     left, right = figure.subplots(1, 2)
     table = precision(cohesive, group)
-    for (name, label), style in zip(FEATURE_LABELS.items(), FEATURE_STYLES, strict=True):
-        if name in table:
-            left.plot(table.index, table[name], label=label, **style)
+    for name, style in zip(map(str, table), cycle(FEATURE_STYLES), strict=False):
+        left.plot(table.index, table[name], label=FEATURE_LABELS.get(name, name), **style)
     most = 1.0 / cohesive.info["cohesion"]["variance_floor"]
     left.axhline(most, color="black", lw=0.8, ls=":", label="perfect agreement")
     left.set_yscale("log")

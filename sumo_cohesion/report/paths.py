@@ -96,8 +96,9 @@ def _moment(rollout: Rollout) -> float:
 def _draw_pull(axis: Axes, rollout: Rollout) -> None:
     """Show which group's steering features pulled, where the ego then was."""
     ego = ego_of(rollout)[["time", "s"]]
+    features = rollout.info["features"].items()
     steering = rollout.agreement[
-        rollout.agreement["feature"].isin(["lateral", "heading", "direction", "place"])
+        rollout.agreement["feature"].isin([name for name, steers in features if steers])
     ]
     pull = steering.groupby(["time", "group"], sort=False)["pull"].sum().unstack("group")
     at = ego.set_index("time")["s"].reindex(pull.index)

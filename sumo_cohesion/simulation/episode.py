@@ -27,7 +27,7 @@ from sumo_cohesion.errors import SimulationError, StoppedError
 from sumo_cohesion.perception.observation import Overview
 from sumo_cohesion.simulation.car import Spent, at_end, drive
 from sumo_cohesion.simulation.fleet import Fleet
-from sumo_cohesion.state import EGO, STEP, Control, Observation, Plan, Scene
+from sumo_cohesion.state import EGO, STEP, STOPPED, Control, Observation, Plan, Scene
 from sumo_cohesion.traffic.contact import contacts
 from sumo_cohesion.traffic.drivers import Drivers
 from sumo_cohesion.traffic.simulator import Simulator
@@ -214,7 +214,7 @@ class Episode:
             self._sumo.step(ego, others)
             following = self._sumo.read()
         except StoppedError:
-            self._finish(scene, "stopped", ())
+            self._finish(scene, STOPPED, ())
             raise
         seconds = Seconds(
             self._looking + spent.remembering, spent.planning, t1 - t0, perf_counter() - t1
@@ -258,7 +258,7 @@ class Episode:
 
     def _finish(self, scene: Scene, outcome: str, touched: tuple[str, ...]) -> None:
         self.outcome = outcome
-        told = () if outcome == "stopped" else tuple(self._sumo.reported_contacts())
+        told = () if outcome == STOPPED else tuple(self._sumo.reported_contacts())
         ending = Ending(
             scene, outcome, touched, told, self._drivers.triggered, self._fleet.summary()
         )

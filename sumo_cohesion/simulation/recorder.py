@@ -11,9 +11,12 @@ import pandas as pd
 
 from sumo_cohesion.errors import SimulationError
 from sumo_cohesion.planning.explanation import Explanation
+from sumo_cohesion.planning.reward import TERMS
 from sumo_cohesion.simulation.episode import Ending, Moment, Seconds
+from sumo_cohesion.social.features import FEATURES, LATERAL
 from sumo_cohesion.state import (
     EGO,
+    LANE_WIDTH,
     AgreementRow,
     BoolArray,
     Control,
@@ -94,13 +97,15 @@ class Recorder:
             "fleet": ending.fleet,
             "hidden": list(setup.scenario.sensing.hidden),
             "special": list(setup.scenario.sensing.special),
+            "features": {**dict(zip(FEATURES, LATERAL, strict=True)), "place": True},
             "solver": self._plans[0][2].solver,
             "n_route_lanes": setup.road.n_route_lanes,
             "traffic_lights": list(setup.traffic_lights),
             "versions": versions(),
         }
-        metrics = run_metrics(info, trajectory, plan, agreement, timing, reference)
+        row = run_metrics(info, trajectory, plan, agreement, timing, reference)
         horizon = self._horizon_table()
+        metrics = as_table("metrics", [row])
         return Rollout(info, trajectory, plan, horizon, agreement, timing, reference, metrics)
 
     def _recorded(self, scene: Scene) -> Scene:
@@ -153,15 +158,16 @@ class Recorder:
         right, left = self._road.drivable_at(ego[:, 0], ego[:, 1])
         limit = self._road.speed_limit_at(ego[:, 0])
         on_exit = self._on_exit(ego)
-        rows = []
+        rows, no_reward = [], {f"reward_{name}": float("nan") for name in TERMS}
         for i, (time, _, plan) in enumerate(self._plans):
             control = plan.controls[0] if plan.controls else _NO_CONTROL
             row: dict[str, object] = {
+                **no_reward,
                 "time": time,
-                "status": plan.status,
-                "fallback": plan.fallback,
-                "intervened": plan.intervened,
-                "iterations": plan.iterations,
+                "status": str(plan.status),
+                "fallback": bool(plan.fallback),
+                "intervened": bool(plan.intervened),
+                "iterations": int(np.nan_to_num(as_number(plan.iterations))),
                 "curvature": control.curvature,
                 "acceleration": control.acceleration,
                 "road_right": right[i],
@@ -169,7 +175,7 @@ class Recorder:
                 "on_exit": on_exit[i],
                 "speed_limit": limit[i],
             }
-            row.update({f"reward_{name}": value for name, value in plan.reward.items()})
+            row |= {f"reward_{name}": as_number(value) for name, value in plan.reward.items()}
             rows.append(row)
         return as_table("plan", rows)
 
@@ -195,7 +201,7 @@ class Recorder:
         nearest = self._road.lane_index(ego[:, 0], ego[:, 1])
         lanes = self._road.lanes_at(ego[:, 0])[:, : self._road.n_route_lanes]
         away = np.nanmin(np.abs(lanes - ego[:, 1:2]), axis=1)
-        return np.asarray((nearest >= self._road.n_route_lanes) & (away > 3.5))
+        return np.asarray((nearest >= self._road.n_route_lanes) & (away > LANE_WIDTH))
 
     def _agreement_table(self) -> pd.DataFrame:
         cohesion = self._setup.cohesion
@@ -226,6 +232,14 @@ class Recorder:
                 "sumo_ms": milliseconds[:, 3],
             },
         )
+
+
+def as_number(value: object) -> float:
+    """Return what a user's planner says of itself as a number; NaN if it is none."""
+    try:
+        return float(value)  # type: ignore[arg-type]
+    except (TypeError, ValueError):
+        return float("nan")
 
 
 def _planned(plan: Plan) -> FloatArray:

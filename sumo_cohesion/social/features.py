@@ -6,23 +6,54 @@ the humans and what the planner makes the ego match is one definition.
 
 from __future__ import annotations
 
-from typing import Any
-
-FEATURES = ("lateral", "longitudinal", "heading", "distance", "direction")
-"""Change of lateral and longitudinal position, of heading, length and direction of the move."""
-
-LATERAL = (True, False, True, False, True)
-"""Which features steer; the others only set the speed."""
-
-SCALES = (1.5, 10.0, 0.15, 10.0, 0.06)
-"""Largest value expected of SUMO's drivers: m/s, m/s, rad/s, m/s, 1 (sine of the direction).
-
-The paper normalises each feature by its maximum difference expected, so that a variance in
-radians can be compared with one in metres.
-"""
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 _STANDSTILL = 0.05
 """Metres per transition; a car that hardly moves has no direction, and this fades it to zero."""
+
+
+class Feature(NamedTuple):
+    """One social feature: declared in this one place.
+
+    Attributes
+    ----------
+    name : as in tables.
+    steers : whether it steers; the others only set the speed.
+    scale : largest value expected of SUMO's drivers. The paper normalises each feature by its
+        maximum difference expected, so that a variance in radians can be compared with one in
+        metres.
+    formula : of ``across``, ``along`` and ``distance`` (m), ``turn`` (rad), ``interval`` (s) and
+        ``scale``; for numbers, arrays and symbols.
+    """
+
+    name: str
+    steers: bool
+    scale: float
+    formula: str
+
+
+DECLARED = (
+    Feature("lateral", True, 1.5, "across / (interval * scale)"),  # m/s
+    Feature("longitudinal", False, 10.0, "along / (interval * scale)"),  # m/s
+    Feature("heading", True, 0.15, "turn / (interval * scale)"),  # rad/s
+    Feature("distance", False, 10.0, "distance / (interval * scale)"),  # m/s
+    Feature("direction", True, 0.06, "across / (distance * scale)"),  # sine of the direction
+)
+FEATURES = tuple(feature.name for feature in DECLARED)
+LATERAL = tuple(feature.steers for feature in DECLARED)
+"""Which features steer."""
+
+
+def _all_in_one() -> Callable[..., tuple[Any, ...]]:
+    """Make one function of all formulas: every car in every step needs it, and a call costs."""
+    formulas = [f.formula.replace("scale", repr(f.scale)) for f in DECLARED]
+    arguments = "across, along, distance, turn, interval"
+    made: Callable[..., tuple[Any, ...]] = eval(f"lambda {arguments}: ({', '.join(formulas)},)")
+    return made
+
+
+_values = _all_in_one()
 
 
 def social_features(
@@ -48,12 +79,4 @@ def social_features(
     across = after[1] - before[1]
     along = (after[0] - before[0]) * (1.0 - curvature * 0.5 * (before[1] + after[1]))
     distance = (across * across + along * along + _STANDSTILL**2) ** 0.5
-    turn = after[2] - before[2]
-    lateral, longitudinal, heading, length, direction = SCALES
-    return (
-        across / (interval * lateral),
-        along / (interval * longitudinal),
-        turn / (interval * heading),
-        distance / (interval * length),
-        across / (distance * direction),
-    )
+    return _values(across, along, distance, after[2] - before[2], interval)

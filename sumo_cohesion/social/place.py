@@ -16,9 +16,9 @@ from sumo_cohesion.road import Road
 from sumo_cohesion.social.agreement import estimate
 from sumo_cohesion.social.features import FEATURES
 from sumo_cohesion.social.settings import CohesionSettings
-from sumo_cohesion.state import RoadState
+from sumo_cohesion.state import LANE_WIDTH, RoadState
 
-SCALE = 3.5
+SCALE = LANE_WIDTH
 """Metres by which positions across the road are normalised: a lane's width."""
 _LATERAL = FEATURES.index("lateral")
 

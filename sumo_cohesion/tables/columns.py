@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
-import pandas as pd
+from sumo_cohesion.tables.column import Column
+from sumo_cohesion.tables.metrics import METRICS
 
-
-class Column(NamedTuple):
-    """One column of a table."""
-
-    name: str
-    dtype: str
-    unit: str
-    meaning: str
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 TRAJECTORY = (
@@ -49,14 +45,13 @@ PLAN = (
     Column("road_left", "float64", "m", "d of the drivable strip's left edge at the ego"),
     Column("on_exit", "bool", "", "nearest to an exit, and off its route by more than a lane"),
     Column("speed_limit", "float64", "m/s", "of the ego's route at the ego"),
-    Column("reward_lane", "float64", "", "reward term over the horizon, weighted"),
-    Column("reward_edge", "float64", "", "reward term over the horizon, weighted"),
-    Column("reward_speed", "float64", "", "reward term over the horizon, weighted"),
-    Column("reward_car", "float64", "", "reward term over the horizon, weighted"),
-    Column("reward_curvature", "float64", "", "reward term over the horizon, weighted"),
-    Column("reward_acceleration", "float64", "", "reward term over the horizon, weighted"),
-    Column("reward_cohesion", "float64", "", "cohesion term, beta included"),
-    Column("reward_constraints", "float64", "", "penalties for being too close to a visible car"),
+    Column(
+        "reward_*",
+        "float64",
+        "",
+        "reward term over the horizon, weighted: lane, edge, speed, car, curvature, acceleration, "
+        "cohesion (beta included), constraints (penalties), and what a planner of one's own names",
+    ),
 )
 
 HORIZON = (
@@ -107,86 +102,6 @@ REFERENCE = (
     Column("twin_speed", "float64", "m/s", "the nominal twin"),
 )
 
-METRICS = (
-    Column("scenario", "string", "", "scenario name"),
-    Column("planner", "string", "", "planner name"),
-    Column("seed", "int64", "", "seed of demand and SUMO"),
-    Column("success", "bool", "", "every condition of the scenario's [success] holds"),
-    Column("outcome", "string", "", "why it ended: collision, finished, route_end, left_route"),
-    Column("collision", "bool", "", "the ego's box touched another's"),
-    Column("collision_with", "string", "", "id of the car touched, empty if none"),
-    Column("collision_time", "float64", "s", "seconds after the start; NaN if none"),
-    Column("collision_visible", "bool", "", "the car touched was one the ego could see"),
-    Column("sumo_collision", "bool", "", "SUMO itself reported a contact of the ego"),
-    Column("off_road", "bool", "", "the ego's side left the drivable strip"),
-    Column("exited", "bool", "", "the ego left its route by an exit, judged by geometry"),
-    Column("distance", "float64", "m", "driven along the route"),
-    Column("travel_time", "float64", "s", "from start to end of the run"),
-    Column("mean_speed", "float64", "m/s", "distance / travel time"),
-    Column(
-        "speed_gap_closed",
-        "float64",
-        "",
-        "share of the humans' gap to the limit, 5 to 15 s after the start",
-    ),
-    Column("max_excess_speed", "float64", "m/s", "largest, over the mean of the humans in 80 m"),
-    Column("max_lateral_shift", "float64", "m", "largest distance across from where it started"),
-    Column("max_speed_shift", "float64", "m/s", "largest difference from the limit"),
-    Column(
-        "speed_most_agreed",
-        "float64",
-        "",
-        "share of steps in which the road group agrees most on the two features of speed",
-    ),
-    Column("plan_lateral_change", "float64", "m", "largest, what cohesion changed in one plan"),
-    Column("plan_speed_change", "float64", "m/s", "largest, what cohesion changed in one plan"),
-    Column("twin_lateral_deviation", "float64", "m", "largest distance across from the twin"),
-    Column("twin_speed_deviation", "float64", "m/s", "largest difference from the twin"),
-    Column("nominal_lateral_deviation", "float64", "m", "as twin, but from nominal's own run"),
-    Column("nominal_speed_deviation", "float64", "m/s", "as twin, but from nominal's own run"),
-    Column("emergency_delay", "float64", "s", "lost by the special vehicle since the first event"),
-    Column("yield_time", "float64", "s", "from the first event to the ego being half a lane right"),
-    Column("passing_lane", "float64", "", "ego's lane as the special vehicle passes; NaN if never"),
-    Column("passing_shift", "float64", "m", "ego's way to the left from its start until then"),
-    Column(
-        "aside_share",
-        "float64",
-        "",
-        "ego's way aside over that of its lane's humans, 0.3 m or more",
-    ),
-    Column("lane_changes", "int64", "", "changes of the ego's nearest lane"),
-    Column("min_gap", "float64", "m", "smallest bumper-to-bumper gap to a car ahead in its path"),
-    Column("min_ttc", "float64", "s", "smallest time to collision; NaN if never closing in"),
-    Column("max_drac", "float64", "m/s²", "largest deceleration needed to avoid a crash"),
-    Column("pet", "float64", "s", "smallest post-encroachment time behind another; NaN if none"),
-    Column("max_jerk", "float64", "m/s³", "largest change of the ego's acceleration"),
-    Column(
-        "max_lateral_acceleration",
-        "float64",
-        "m/s²",
-        "largest speed · yaw rate of the ego; SUMO's own turns in steps where lanes bend",
-    ),
-    Column("human_mean_speed", "float64", "m/s", "mean over humans that ever moved"),
-    Column("human_hard_brakes", "int64", "", "times a human began to brake harder than 4.5 m/s²"),
-    Column("plan_failures", "int64", "", "steps driven by the fallback"),
-    Column("plan_rescues", "int64", "", "steps in which the solver failed and IPOPT did not"),
-    Column("interventions", "int64", "", "steps in which the last resort changed the control"),
-    Column(
-        "penetration",
-        "float64",
-        "",
-        "mean share of planned cars, ego included, among those in its range; no hidden, special",
-    ),
-    Column("fleet_size", "int64", "", "distinct cars that planners drove besides the ego"),
-    Column("fleet_collisions", "int64", "", "of these, how many touched something while planned"),
-    Column(
-        "fleet_interventions", "int64", "", "as interventions, over all planned cars but the ego"
-    ),
-    Column("fleet_failures", "int64", "", "as plan_failures, over all planned cars but the ego"),
-    Column("plan_ms_median", "float64", "ms", "planner's call, median"),
-    Column("plan_ms_p99", "float64", "ms", "planner's call, 99th percentile"),
-)
-
 BATCH = (
     Column("run", "string", "", "key: digest of everything that decides the run's result"),
     Column("status", "string", "", "done, error, crash, timeout, memory or changed"),
@@ -196,15 +111,7 @@ BATCH = (
 )
 """Columns before those of a run's metrics. In a run without result all metrics are missing."""
 
-OF_REFERENCE = (
-    "plan_lateral_change",
-    "plan_speed_change",
-    "twin_lateral_deviation",
-    "twin_speed_deviation",
-)
-"""Metrics that need a scenario's ``reference``."""
-
-TABLES = {
+TABLES: dict[str, Sequence[Column]] = {
     "trajectory": TRAJECTORY,
     "plan": PLAN,
     "horizon": HORIZON,
@@ -215,11 +122,24 @@ TABLES = {
 }
 
 
-def as_table(name: str, data: dict[str, object] | list[dict[str, object]]) -> pd.DataFrame:
-    """Make a DataFrame with exactly the columns and dtypes of the named table."""
-    columns = TABLES[name]
-    frame = pd.DataFrame(data, columns=[c.name for c in columns])
-    return frame.astype({c.name: c.dtype for c in columns})
+def as_table(
+    name: str, data: Mapping[str, object] | Sequence[Mapping[str, object]]
+) -> pd.DataFrame:
+    """Make a DataFrame with the columns and dtypes of the named table, from columns or rows.
+
+    Of columns that it does not name those remain that one of its names with a star stands for.
+    """
+    import pandas as pd
+
+    told = data if isinstance(data, Mapping) else {key: None for row in data for key in row}
+    dtypes: dict[str, str] = {}
+    for column in TABLES[name]:
+        if column.name.endswith("*"):
+            found = [key for key in told if key.startswith(column.name[:-1])]
+            dtypes |= dict.fromkeys(found, column.dtype)
+        else:
+            dtypes[column.name] = column.dtype
+    return pd.DataFrame(data, columns=list(dtypes)).astype(dtypes)
 
 
 def describe_tables() -> str:

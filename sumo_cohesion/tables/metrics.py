@@ -1,4 +1,7 @@
-"""Metrics: pure functions of the saved tables.
+"""Metrics: pure functions of the saved tables, each declared where it is worked out.
+
+A metric is a function with its columns above it. What it needs of a run it names as arguments
+(`Measured`); it returns a value, or by name the values of its columns.
 
 Surrogate safety measures as in SUMO's SSM device
 (https://sumo.dlr.de/docs/Simulation/Output/SSM_Device.html), computed from the driven states.
@@ -6,17 +9,73 @@ Surrogate safety measures as in SUMO's SSM device
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+import inspect
+from collections.abc import Callable, Collection, Mapping
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
-import pandas as pd
 
-from sumo_cohesion.state import EGO, RESCUED, FloatArray
-from sumo_cohesion.tables.columns import as_table
+from sumo_cohesion.state import EGO, LANE_WIDTH, RESCUED, STEP, STOPPED, FloatArray
+from sumo_cohesion.tables.column import Column
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 HARD_BRAKE = 4.5
 """m/s², SUMO's default comfortable deceleration: braking harder is not normal driving."""
+
+SUCCESS = Column("success", "bool", "", "every condition of the scenario's [success] holds")
+METRICS: list[Column] = [
+    Column("scenario", "string", "", "scenario name"),
+    Column("planner", "string", "", "planner name"),
+    Column("seed", "int64", "", "seed of demand and SUMO"),
+    SUCCESS,
+]
+"""All columns of the table, in order: which run it is, then what follows below."""
+OF_REFERENCE: list[str] = []
+"""Metrics that need a scenario's ``reference``."""
+
+
+class Measured(NamedTuple):
+    """What a metric may be worked out from: its arguments bear these names.
+
+    Attributes
+    ----------
+    info : the run's run.json.
+    ego, others : rows of the trajectory.
+    humans : those of the others that SUMO drove and that are neither hidden nor special.
+    plan, agreement, timing, reference : the tables.
+    speed_features : social features that set the speed and do not steer.
+    """
+
+    info: Mapping[str, Any]
+    ego: pd.DataFrame
+    others: pd.DataFrame
+    humans: pd.DataFrame
+    plan: pd.DataFrame
+    agreement: pd.DataFrame
+    timing: pd.DataFrame
+    reference: pd.DataFrame
+    speed_features: Collection[str]
+
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+_FUNCTIONS: list[tuple[Callable[..., Any], tuple[str, ...], tuple[str, ...]]] = []
+"""Functions, the names of their columns and those of their arguments."""
+
+
+def metric(*columns: Column) -> Callable[[Function], Function]:
+    """Declare the columns that a function fills."""
+
+    def declared(function: Function) -> Function:
+        needs, names = tuple(inspect.signature(function).parameters), [c.name for c in columns]
+        _FUNCTIONS.append((function, tuple(names), needs))
+        METRICS.extend(columns)
+        if "reference" in needs:
+            OF_REFERENCE.extend(names)
+        return function
+
+    return declared
 
 
 def run_metrics(
@@ -26,65 +85,39 @@ def run_metrics(
     agreement: pd.DataFrame,
     timing: pd.DataFrame,
     reference: pd.DataFrame,
-) -> pd.DataFrame:
-    """All metrics of one run: one row, see columns.METRICS."""
+) -> dict[str, Any]:
+    """All metrics of one run, by name."""
     ego = trajectory[trajectory["vehicle"] == EGO]
     others = trajectory[trajectory["vehicle"] != EGO]
     # A planned car that has touched something is handed to SUMO, but is no human's to drive.
     not_human = [*info["hidden"], *info["special"], *info["fleet"]["touched"]]
     humans = others[~(others["vehicle"].isin(not_human) | others["planned"])]
-    touched = info["touched"]
-    start, end = ego["time"].iloc[0], ego["time"].iloc[-1]
-    distance = float(ego["s"].iloc[-1] - ego["s"].iloc[0])
+    speed = [name for name, steers in info["features"].items() if not steers]
+    measured = Measured(info, ego, others, humans, plan, agreement, timing, reference, speed)
     row: dict[str, Any] = {
         "scenario": info["scenario"]["name"],
         "planner": info["planner"],
         "seed": info["seed"],
-        "outcome": info["outcome"],
-        "collision": bool(touched),
-        "collision_with": touched[0] if touched else "",
-        "collision_time": float(end - start) if touched else np.nan,
-        "collision_visible": bool(set(touched) - set(info["hidden"])),
-        "sumo_collision": bool(info["touched_by_sumo"]),
-        "off_road": off_road(ego, plan),
-        "exited": bool(plan["on_exit"].any()),
-        "distance": distance,
-        "travel_time": float(end - start),
-        "mean_speed": distance / float(end - start),
-        "speed_gap_closed": speed_gap_closed(ego, humans, plan),
-        "speed_most_agreed": speed_most_agreed(agreement),
-        **reference_metrics(ego, reference),
-        "max_excess_speed": max_excess_speed(ego, humans),
-        **emergency_metrics(info, ego, others),
-        **passing_metrics(info, ego, others),
-        "aside_share": aside_share(info, ego, others),
-        "max_lateral_shift": float((ego["d"] - ego["d"].iloc[0]).abs().max()),
-        "max_speed_shift": max_speed_shift(ego, plan),
-        "lane_changes": int((np.diff(ego["lane"]) != 0).sum()),
-        **gap_metrics(ego, others),
-        "pet": post_encroachment_time(ego, others),
-        "max_jerk": max_jerk(ego),
-        "max_lateral_acceleration": max_lateral_acceleration(ego),
-        **human_metrics(humans),
-        "plan_failures": int(plan["fallback"].sum()),
-        "plan_rescues": int(plan["status"].str.startswith(RESCUED).sum()),
-        "interventions": int(plan["intervened"].sum()),
-        **fleet_metrics(info, ego, others),
-        "plan_ms_median": float(timing["plan_ms"].median()),
-        "plan_ms_p99": float(timing["plan_ms"].quantile(0.99)),
     }
+    for function, names, needs in _FUNCTIONS:
+        found = function(**{name: getattr(measured, name) for name in needs})
+        row |= found if isinstance(found, Mapping) else {names[0]: found}
     row["success"] = succeeded(row, info["scenario"]["success"])
-    return as_table("metrics", [row])
+    return row
 
 
 def succeeded(row: Mapping[str, Any], conditions: Mapping[str, Any]) -> bool:
     """Tell whether every condition of a scenario's [success] holds; a NaN never does.
 
+    Of a run that SUMO stopped nobody knows how it would have ended: it is no success.
+
     >>> succeeded({"collision": False, "distance": 640.0}, {"distance": {"min": 600}})
     True
     """
-    for metric, wanted in conditions.items():
-        value = row[metric]
+    if row.get("outcome") == STOPPED:
+        return False
+    for name, wanted in conditions.items():
+        value = row[name]
         if isinstance(wanted, Mapping):
             low, high = wanted.get("min"), wanted.get("max")
             if not (low is None or value >= low) or not (high is None or value <= high):
@@ -94,6 +127,36 @@ def succeeded(row: Mapping[str, Any], conditions: Mapping[str, Any]) -> bool:
     return True
 
 
+@metric(
+    Column("outcome", "string", "", "why it ended: collision, finished, route_end, left_route"),
+)
+def outcome(info: Mapping[str, Any]) -> str:
+    """Return what ended the run (simulation.episode)."""
+    return str(info["outcome"])
+
+
+@metric(
+    Column("collision", "bool", "", "the ego's box touched another's"),
+    Column("collision_with", "string", "", "id of the car touched, empty if none"),
+    Column("collision_time", "float64", "s", "seconds after the start; NaN if none"),
+    Column("collision_visible", "bool", "", "the car touched was one the ego could see"),
+    Column("sumo_collision", "bool", "", "SUMO itself reported a contact of the ego"),
+)
+def collision_metrics(info: Mapping[str, Any], ego: pd.DataFrame) -> dict[str, Any]:
+    """Whether, with whom and when the ego touched another; the run ends with it."""
+    touched, time = info["touched"], ego["time"]
+    return {
+        "collision": bool(touched),
+        "collision_with": touched[0] if touched else "",
+        "collision_time": float(time.iloc[-1] - time.iloc[0]) if touched else np.nan,
+        "collision_visible": bool(set(touched) - set(info["hidden"])),
+        "sumo_collision": bool(info["touched_by_sumo"]),
+    }
+
+
+@metric(
+    Column("off_road", "bool", "", "the ego's side left the drivable strip"),
+)
 def off_road(ego: pd.DataFrame, plan: pd.DataFrame) -> bool:
     """Tell whether the ego's side was ever beyond an edge of the drivable strip."""
     d = ego["d"].to_numpy()[: len(plan)]
@@ -102,6 +165,34 @@ def off_road(ego: pd.DataFrame, plan: pd.DataFrame) -> bool:
     return bool(beyond.any())
 
 
+@metric(
+    Column("exited", "bool", "", "the ego left its route by an exit, judged by geometry"),
+)
+def exited(plan: pd.DataFrame) -> bool:
+    """Tell whether the ego was ever on an exit that has parted from its route."""
+    return bool(plan["on_exit"].any())
+
+
+@metric(
+    Column("distance", "float64", "m", "driven along the route"),
+    Column("travel_time", "float64", "s", "from start to end of the run"),
+    Column("mean_speed", "float64", "m/s", "distance / travel time"),
+)
+def travel_metrics(ego: pd.DataFrame) -> dict[str, float]:
+    """How far and how fast the ego came along its route."""
+    distance = float(ego["s"].iloc[-1] - ego["s"].iloc[0])
+    seconds = float(ego["time"].iloc[-1] - ego["time"].iloc[0])
+    return {"distance": distance, "travel_time": seconds, "mean_speed": distance / seconds}
+
+
+@metric(
+    Column(
+        "speed_gap_closed",
+        "float64",
+        "",
+        "share of the humans' gap to the limit, 5 to 15 s after the start",
+    ),
+)
 def speed_gap_closed(ego: pd.DataFrame, humans: pd.DataFrame, plan: pd.DataFrame) -> float:
     """Share of the gap between the limit and the humans' speed that the ego closed.
 
@@ -120,6 +211,9 @@ def speed_gap_closed(ego: pd.DataFrame, humans: pd.DataFrame, plan: pd.DataFrame
     return float((own["speed"].mean() - limit) / gap) if abs(gap) >= 0.5 else np.nan
 
 
+@metric(
+    Column("max_excess_speed", "float64", "m/s", "largest, over the mean of the humans in 80 m"),
+)
 def max_excess_speed(ego: pd.DataFrame, humans: pd.DataFrame) -> float:
     """Largest excess (m/s) of the ego's speed over the mean of the humans within 80 m.
 
@@ -131,33 +225,59 @@ def max_excess_speed(ego: pd.DataFrame, humans: pd.DataFrame) -> float:
     return float((by_time["speed_ego"].first() - by_time["speed"].mean()).max())
 
 
+@metric(
+    Column("max_lateral_shift", "float64", "m", "largest distance across from where it started"),
+)
+def max_lateral_shift(ego: pd.DataFrame) -> float:
+    """Largest distance across the road (m) from where the ego started."""
+    return float((ego["d"] - ego["d"].iloc[0]).abs().max())
+
+
+@metric(
+    Column("max_speed_shift", "float64", "m/s", "largest difference from the limit"),
+)
 def max_speed_shift(ego: pd.DataFrame, plan: pd.DataFrame) -> float:
     """Largest difference (m/s) between the ego's speed and the limit of its route."""
     speed = ego["speed"].to_numpy()[: len(plan)]
     return float(np.abs(speed - plan["speed_limit"].to_numpy()).max())
 
 
-def speed_most_agreed(agreement: pd.DataFrame) -> float:
-    """Share of steps in which the road group's two largest precisions are those of the speed.
+@metric(
+    Column(
+        "speed_most_agreed",
+        "float64",
+        "",
+        "share of steps in which the road group agrees most on the two features of speed",
+    ),
+)
+def speed_most_agreed(
+    agreement: pd.DataFrame, speed_features: Collection[str] = ("distance", "longitudinal")
+) -> float:
+    """Share of steps in which the road group's largest precisions are those of the speed.
 
     That is of distance and longitudinal, among all social features (paper, figure 7a). Only steps
     in which the group has enough cars count; NaN if there are none.
     """
     road = agreement[(agreement["group"] == "road") & agreement["precision"].notna()]
     by_feature = road.pivot_table(index="time", columns="feature", values="precision")
-    if not {"distance", "longitudinal"} < set(by_feature.columns):
+    if not set(speed_features) < set(by_feature.columns):
         return np.nan  # none, or those of a planner that has other features
-    of_speed = by_feature[["distance", "longitudinal"]].min(axis=1)
-    others = by_feature.drop(columns=["distance", "longitudinal"]).max(axis=1)
+    of_speed = by_feature[list(speed_features)].min(axis=1)
+    others = by_feature.drop(columns=list(speed_features)).max(axis=1)
     return float((of_speed > others).mean())
 
 
+@metric(
+    Column("plan_lateral_change", "float64", "m", "largest, what cohesion changed in one plan"),
+    Column("plan_speed_change", "float64", "m/s", "largest, what cohesion changed in one plan"),
+    Column("twin_lateral_deviation", "float64", "m", "largest distance across from the twin"),
+    Column("twin_speed_deviation", "float64", "m/s", "largest difference from the twin"),
+)
 def reference_metrics(ego: pd.DataFrame, reference: pd.DataFrame) -> dict[str, float]:
     """Say what cohesion changed: largest absolute values over the run; NaN without a reference.
 
     plan_*: within one horizon, against the nominal plan from the same state. twin_*: against a
     nominal car that started as the ego did and drove through the same traffic on its own.
-    nominal_*, against nominal's own run of the same seed, needs that run: compare() fills it in.
     """
     twin = reference.merge(ego[["time", "d", "speed"]], on="time")
     return {
@@ -165,9 +285,16 @@ def reference_metrics(ego: pd.DataFrame, reference: pd.DataFrame) -> dict[str, f
         "plan_speed_change": _largest(reference["plan_speed"]),
         "twin_lateral_deviation": _largest(twin["d"] - twin["twin_d"]),
         "twin_speed_deviation": _largest(twin["speed"] - twin["twin_speed"]),
-        "nominal_lateral_deviation": np.nan,
-        "nominal_speed_deviation": np.nan,
     }
+
+
+@metric(
+    Column("nominal_lateral_deviation", "float64", "m", "as twin, but from nominal's own run"),
+    Column("nominal_speed_deviation", "float64", "m/s", "as twin, but from nominal's own run"),
+)
+def nominal_metrics() -> dict[str, float]:
+    """As of the twin, but against nominal's own run of the same seed: compare() fills it in."""
+    return {"nominal_lateral_deviation": np.nan, "nominal_speed_deviation": np.nan}
 
 
 def deviation(ego: pd.DataFrame, other: pd.DataFrame) -> tuple[float, float]:
@@ -183,6 +310,10 @@ def _largest(values: pd.Series) -> float:
     return float(values.abs().max()) if len(values) else np.nan
 
 
+@metric(
+    Column("emergency_delay", "float64", "s", "lost by the special vehicle since the first event"),
+    Column("yield_time", "float64", "s", "from the first event to the ego being half a lane right"),
+)
 def emergency_metrics(
     info: Mapping[str, Any], ego: pd.DataFrame, others: pd.DataFrame
 ) -> dict[str, float]:
@@ -190,7 +321,7 @@ def emergency_metrics(
 
     emergency_delay: from the scenario's first ``near`` event to the end of the run, the time
     (s) that the special vehicle lost against driving at the fastest speed it ever had. yield_time:
-    seconds from that event until the ego was half a lane (1.75 m) right of where it was. NaN
+    seconds from that event until the ego was half a lane right of where it was. NaN
     where there is no special vehicle or event, or the ego never moved over.
     """
     nothing = {"emergency_delay": np.nan, "yield_time": np.nan}
@@ -205,13 +336,17 @@ def emergency_metrics(
     passed = float(after["time"].iloc[-1] - after["time"].iloc[0])
     driven = float(after["s"].iloc[-1] - after["s"].iloc[0])
     own = ego[ego["time"] >= event]
-    aside = own[own["d"] < own["d"].iloc[0] - 1.75]
+    aside = own[own["d"] < own["d"].iloc[0] - LANE_WIDTH / 2]
     return {
         "emergency_delay": passed - driven / float(vehicle["speed"].max()),
         "yield_time": float(aside["time"].iloc[0] - event) if len(aside) else np.nan,
     }
 
 
+@metric(
+    Column("passing_lane", "float64", "", "ego's lane as the special vehicle passes; NaN if never"),
+    Column("passing_shift", "float64", "m", "ego's way to the left from its start until then"),
+)
 def passing_metrics(
     info: Mapping[str, Any], ego: pd.DataFrame, others: pd.DataFrame
 ) -> dict[str, float]:
@@ -236,6 +371,14 @@ def passing_metrics(
     }
 
 
+@metric(
+    Column(
+        "aside_share",
+        "float64",
+        "",
+        "ego's way aside over that of its lane's humans, 0.3 m or more",
+    ),
+)
 def aside_share(info: Mapping[str, Any], ego: pd.DataFrame, others: pd.DataFrame) -> float:
     """How far the ego moved aside for the special vehicle, as a share of what humans did.
 
@@ -270,6 +413,19 @@ def _way_aside(car: pd.DataFrame, special: pd.DataFrame) -> float:
     return float(both["d"].iloc[nearest] - car["d"].iloc[0])
 
 
+@metric(
+    Column("lane_changes", "int64", "", "changes of the ego's nearest lane"),
+)
+def lane_changes(ego: pd.DataFrame) -> int:
+    """How often the ego's nearest lane changed."""
+    return int((np.diff(ego["lane"]) != 0).sum())
+
+
+@metric(
+    Column("min_gap", "float64", "m", "smallest bumper-to-bumper gap to a car ahead in its path"),
+    Column("min_ttc", "float64", "s", "smallest time to collision; NaN if never closing in"),
+    Column("max_drac", "float64", "m/s²", "largest deceleration needed to avoid a crash"),
+)
 def gap_metrics(ego: pd.DataFrame, others: pd.DataFrame) -> dict[str, float]:
     """Smallest gap and time to collision, largest deceleration needed, to cars in the path.
 
@@ -298,6 +454,9 @@ def _least(values: pd.Series) -> float:
     return float(values.min()) if len(values) else np.nan
 
 
+@metric(
+    Column("pet", "float64", "s", "smallest post-encroachment time behind another; NaN if none"),
+)
 def post_encroachment_time(ego: pd.DataFrame, others: pd.DataFrame) -> float:
     """Smallest time (s) from another car's rear leaving a place to the ego's front entering it.
 
@@ -323,11 +482,22 @@ def post_encroachment_time(ego: pd.DataFrame, others: pd.DataFrame) -> float:
     return smallest
 
 
+@metric(
+    Column("max_jerk", "float64", "m/s³", "largest change of the ego's acceleration"),
+)
 def max_jerk(ego: pd.DataFrame) -> float:
     """Largest |change of acceleration| per second (m/s³), by differences of the speed."""
     return _peak(_rate(_rate(ego["speed"].to_numpy(), ego), ego))
 
 
+@metric(
+    Column(
+        "max_lateral_acceleration",
+        "float64",
+        "m/s²",
+        "largest speed · yaw rate of the ego; SUMO's own turns in steps where lanes bend",
+    ),
+)
 def max_lateral_acceleration(ego: pd.DataFrame) -> float:
     """Largest |speed · yaw rate| (m/s²)."""
     heading = np.unwrap(ego["heading"].to_numpy())
@@ -344,6 +514,10 @@ def _peak(values: FloatArray) -> float:
     return float(np.abs(values).max()) if values.size else 0.0
 
 
+@metric(
+    Column("human_mean_speed", "float64", "m/s", "mean over humans that ever moved"),
+    Column("human_hard_brakes", "int64", "", "times a human began to brake harder than 4.5 m/s²"),
+)
 def human_metrics(humans: pd.DataFrame) -> dict[str, float]:
     """Mean speed of the humans near the ego, and how often one began to brake hard."""
     moved = humans.groupby("vehicle")["speed"].transform("max") > 0.1
@@ -353,12 +527,40 @@ def human_metrics(humans: pd.DataFrame) -> dict[str, float]:
         time, speed = car["time"].to_numpy(), car["speed"].to_numpy()
         step = np.diff(time)
         # A car may leave the range and come back: such a gap is no braking.
-        hard = (np.diff(speed) / step < -HARD_BRAKE - 1e-6) & (step < 0.15)
+        hard = (np.diff(speed) / step < -HARD_BRAKE - 1e-6) & (step < 1.5 * STEP)
         brakes += int((hard & ~np.concatenate(([False], hard[:-1]))).sum())
     mean_speed = float(humans["speed"].mean()) if len(humans) else np.nan
     return {"human_mean_speed": mean_speed, "human_hard_brakes": brakes}
 
 
+@metric(
+    Column("plan_failures", "int64", "", "steps driven by the fallback"),
+    Column("plan_rescues", "int64", "", "steps in which the solver failed and IPOPT did not"),
+    Column("interventions", "int64", "", "steps in which the last resort changed the control"),
+)
+def plan_metrics(plan: pd.DataFrame) -> dict[str, int]:
+    """How many steps the fallback drove, IPOPT rescued, the last resort changed."""
+    return {
+        "plan_failures": int(plan["fallback"].sum()),
+        "plan_rescues": int(plan["status"].str.startswith(RESCUED).sum()),
+        "interventions": int(plan["intervened"].sum()),
+    }
+
+
+@metric(
+    Column(
+        "penetration",
+        "float64",
+        "",
+        "mean share of planned cars, ego included, among those in its range; no hidden, special",
+    ),
+    Column("fleet_size", "int64", "", "distinct cars that planners drove besides the ego"),
+    Column("fleet_collisions", "int64", "", "of these, how many touched something while planned"),
+    Column(
+        "fleet_interventions", "int64", "", "as interventions, over all planned cars but the ego"
+    ),
+    Column("fleet_failures", "int64", "", "as plan_failures, over all planned cars but the ego"),
+)
 def fleet_metrics(
     info: Mapping[str, Any], ego: pd.DataFrame, others: pd.DataFrame
 ) -> dict[str, float]:
@@ -378,4 +580,16 @@ def fleet_metrics(
         "fleet_collisions": len(fleet["touched"]),
         "fleet_interventions": fleet["interventions"],
         "fleet_failures": fleet["failures"],
+    }
+
+
+@metric(
+    Column("plan_ms_median", "float64", "ms", "planner's call, median"),
+    Column("plan_ms_p99", "float64", "ms", "planner's call, 99th percentile"),
+)
+def time_metrics(timing: pd.DataFrame) -> dict[str, float]:
+    """Wall time of the planner's call."""
+    return {
+        "plan_ms_median": float(timing["plan_ms"].median()),
+        "plan_ms_p99": float(timing["plan_ms"].quantile(0.99)),
     }

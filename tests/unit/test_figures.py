@@ -16,7 +16,8 @@ from matplotlib.patches import Rectangle
 
 from sumo_cohesion import Rollout, UserError, run
 from sumo_cohesion.planning.landscape import PLACES, reward_landscape
-from sumo_cohesion.planning.settings import PlannerSettings, RewardWeights
+from sumo_cohesion.planning.reward import RewardWeights
+from sumo_cohesion.planning.settings import PlannerSettings
 from sumo_cohesion.report import drawing, paper
 from sumo_cohesion.road import Road
 from sumo_cohesion.state import Observation, RoadState

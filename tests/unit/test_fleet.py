@@ -53,7 +53,7 @@ def crowd(n: int) -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:
 
 
 def scene_of(n: int) -> Scene:
-    """The ego among n others."""
+    """Put the ego among n others."""
     ids, states, sizes = crowd(n)
     return Scene(3.0, CartesianState(200.0, -5.0, 0.02, 21.0), (5.0, 1.8), ids, states, sizes)
 

@@ -128,7 +128,7 @@ def test_mean_interval_covers_and_is_repeatable() -> None:
 
 
 def test_summary_counts_only_runs_where_the_metric_is_defined() -> None:
-    from sumo_cohesion.tables.columns import METRICS
+    from sumo_cohesion.tables.metrics import METRICS
 
     zeros = {"string": "", "bool": False, "int64": 0, "float64": 1.0}
     row = {c.name: zeros[c.dtype] for c in METRICS}

@@ -14,7 +14,7 @@ from sumo_cohesion.perception.history import History
 from sumo_cohesion.road import Road
 from sumo_cohesion.social.agreement import Agreement, agree, combine, estimate
 from sumo_cohesion.social.election import Election
-from sumo_cohesion.social.features import FEATURES, SCALES, social_features
+from sumo_cohesion.social.features import DECLARED, FEATURES, social_features
 from sumo_cohesion.social.groups import Vote, group_votes
 from sumo_cohesion.social.memory import new_history
 from sumo_cohesion.social.place import NOWHERE, agree_on_place
@@ -61,7 +61,7 @@ def drive(h: History, steps: int, cars: dict[str, tuple[float, float, float, flo
 
 def test_features_by_hand() -> None:
     psi = dict(zip(FEATURES, social_features((0, 0, 0, 20), (3, 4, 0.3, 20), 1.0), strict=True))
-    scale = dict(zip(FEATURES, SCALES, strict=True))
+    scale = {feature.name: feature.scale for feature in DECLARED}
     assert psi["lateral"] * scale["lateral"] == pytest.approx(4.0)
     assert psi["longitudinal"] * scale["longitudinal"] == pytest.approx(3.0)
     assert psi["heading"] * scale["heading"] == pytest.approx(0.3)
@@ -98,7 +98,7 @@ def test_on_a_curve_equal_speeds_in_two_lanes_are_equal_features() -> None:
     for d in (0.0, -3.5):
         along = 10.0 / (1.0 - 0.01 * d)
         psi = social_features((0, d, 0, 20), (along, d, 0, 20), 0.5, 0.01)
-        assert psi[1] * SCALES[1] == pytest.approx(20.0)
+        assert psi[1] * DECLARED[1].scale == pytest.approx(20.0)
 
 
 def test_history_transitions_span_half_a_second_and_headings_are_of_displacement() -> None:
@@ -108,8 +108,8 @@ def test_history_transitions_span_half_a_second_and_headings_are_of_displacement
     assert track.state[2] == pytest.approx(atan2(1.0, 20.0))
     psi = track.newest()
     assert psi is not None
-    assert psi[0] * SCALES[0] == pytest.approx(1.0)
-    assert psi[1] * SCALES[1] == pytest.approx(20.0)
+    assert psi[0] * DECLARED[0].scale == pytest.approx(1.0)
+    assert psi[1] * DECLARED[1].scale == pytest.approx(20.0)
     assert psi[2] == pytest.approx(0.0, abs=1e-9)
     assert track.middle_s[-1] == pytest.approx(100.0 + 20.0 * (1.9 - 0.25))
     assert len(track.steps) == 20 - 5

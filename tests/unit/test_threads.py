@@ -8,7 +8,8 @@ import sys
 
 import pytest
 
-from sumo_cohesion.planning.settings import PlannerSettings, RewardWeights
+from sumo_cohesion.planning.reward import RewardWeights
+from sumo_cohesion.planning.settings import PlannerSettings
 from sumo_cohesion.planning.solvers import compiled
 from sumo_cohesion.planning.solvers.mpc import Mpc, shared_solver
 from tests.conftest import ROOT

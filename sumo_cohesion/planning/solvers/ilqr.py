@@ -25,13 +25,13 @@ import casadi as ca
 import numpy as np
 
 from sumo_cohesion.planning.problem import Instance, Solution
+from sumo_cohesion.planning.reward import TERMS
 from sumo_cohesion.planning.settings import PlannerSettings
 from sumo_cohesion.planning.solvers.compiled import BoundCall, Numbers, compiled
 from sumo_cohesion.planning.stage import (
     CONTROL_SCALE,
     N_STATES,
     SCALES,
-    TERMS,
     Stage,
     StageParameters,
     control_limits,

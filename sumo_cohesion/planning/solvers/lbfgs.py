@@ -13,12 +13,12 @@ import numpy as np
 from scipy.optimize import minimize
 
 from sumo_cohesion.planning.problem import Instance, Solution
+from sumo_cohesion.planning.reward import TERMS
 from sumo_cohesion.planning.settings import PlannerSettings
 from sumo_cohesion.planning.solvers.compiled import BoundCall, compiled
 from sumo_cohesion.planning.stage import (
     CONTROL_SCALE,
     N_STATES,
-    TERMS,
     UNLIMITED,
     StageParameters,
     limited_stage,

@@ -13,7 +13,8 @@ from typing import Protocol
 import numpy as np
 
 from sumo_cohesion.planning.problem import Instance, Problem, Solution
-from sumo_cohesion.planning.settings import PlannerSettings, RewardWeights
+from sumo_cohesion.planning.reward import RewardWeights
+from sumo_cohesion.planning.settings import PlannerSettings
 from sumo_cohesion.planning.solvers import SOLVERS
 from sumo_cohesion.planning.solvers.compiled import BUILDING
 from sumo_cohesion.planning.solvers.transcription import Transcription

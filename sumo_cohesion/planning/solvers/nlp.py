@@ -15,12 +15,12 @@ import numpy as np
 
 from sumo_cohesion.planning import dynamics
 from sumo_cohesion.planning.problem import Instance, Solution
+from sumo_cohesion.planning.reward import TERMS
 from sumo_cohesion.planning.settings import PlannerSettings
 from sumo_cohesion.planning.stage import (
     CONTROL_SCALE,
     N_STATES,
     SCALES,
-    TERMS,
     StageParameters,
     make_stage,
     rate_excess,
