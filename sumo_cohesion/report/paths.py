@@ -13,6 +13,7 @@ from sumo_cohesion.batches.comparison import COMPARISON_FILE, run_folder
 from sumo_cohesion.errors import UserError
 from sumo_cohesion.report import drawing
 from sumo_cohesion.report.drawing import ego_of
+from sumo_cohesion.tables.folders import claim
 from sumo_cohesion.tables.rollout import Rollout
 
 if TYPE_CHECKING:
@@ -25,7 +26,7 @@ PICTURE = "paths.png"
 def draw_run(folder: Path, out: Path | None = None) -> Path:
     """Draw one run from its folder; returns the picture's path."""
     rollout = Rollout.read(folder)
-    return drawing.save(_draw([rollout]), out or folder / PICTURE)
+    return drawing.save(_draw([rollout]), out or claim(folder, PICTURE))
 
 
 def draw_comparison(folder: Path, out: Path | None = None, seed: int | None = None) -> Path:
@@ -38,7 +39,7 @@ def draw_comparison(folder: Path, out: Path | None = None, seed: int | None = No
     if chosen not in about["seeds"]:
         raise UserError(f"{folder}: has no seed {chosen}; its seeds are {about['seeds']}")
     rollouts = [Rollout.read(run_folder(folder, p, chosen)) for p in about["planners"]]
-    return drawing.save(_draw(rollouts), out or folder / PICTURE)
+    return drawing.save(_draw(rollouts), out or claim(folder, PICTURE))
 
 
 def _draw(rollouts: list[Rollout]) -> Figure:

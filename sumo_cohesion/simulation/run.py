@@ -66,16 +66,23 @@ def run(
     if folder is not None:  # before the drive, not after
         require_replaceable(folder)
     setup = prepare(RunRequest(scenario, planner, seed, overrides or {}))
-    try:
+    with _kept(folder):
         rollout = simulate(setup, sumo_outputs=sumo_outputs, gui=gui, listeners=listeners)
+    if folder is not None:
+        rollout.write(folder)
+    return rollout
+
+
+@contextmanager
+def _kept(folder: Path | None) -> Iterator[None]:
+    """Write what was recorded of a run that SUMO stopped."""
+    try:
+        yield
     except StoppedError as error:
         if folder is None or not isinstance(error.rollout, Rollout):
             raise
         error.rollout.write(folder)
         raise error.said(f"what was recorded until then is in {folder}") from None
-    if folder is not None:
-        rollout.write(folder)
-    return rollout
 
 
 def simulate(
