@@ -1,37 +1,39 @@
-"""Who may import whom, and what importing the package costs."""
+"""Who may load whom, directly or not, and what importing the package costs."""
 
 from __future__ import annotations
 
 import ast
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
 import pytest
 
 PACKAGE = Path(__file__).resolve().parent.parent / "sumo_cohesion"
 
-# Rooms in the order of one step; a room may import those its row names, and the shared values.
-SHARED = {"errors", "locks", "state", "road"}
+# What a module of a room may load, directly or through others; besides its own room.
+SHARED = {"errors", "locks", "state", "road", "user_input", "versions"}
+ONE_CAR = SHARED | {"perception", "social", "planning"}
+RUN = ONE_CAR | {"traffic", "tables", "simulation"}
 ALLOWED = {
     "errors": set(),
     "locks": set(),
-    "state": set(),
     "versions": set(),
+    "state": set(),
     "user_input": {"errors"},
     "road": {"state"},
-    "traffic": SHARED | {"user_input"},
+    "traffic": SHARED,
     "perception": SHARED,
     "social": SHARED | {"perception"},
     "planning": SHARED | {"perception", "social"},
     "tables": {"errors", "state"},
-    "simulation": SHARED
-    | {"traffic", "perception", "social", "planning", "tables", "user_input", "versions"},
-    "batches": SHARED | {"traffic", "planning", "simulation", "tables", "user_input", "versions"},
-    "report": SHARED | {"tables", "batches"},
-    "cli": {"errors", "simulation", "tables", "batches", "report", "user_input"},
-    "__main__": {"cli"},
-    "__init__": {"errors", "simulation", "tables", "batches"},
+    "simulation": RUN,
+    "batches": RUN,
+    "report": {"errors", "state", "tables"},
+    "cli": RUN | {"batches", "report", "__init__"},
+    "__main__": RUN | {"batches", "report", "cli"},
+    "__init__": RUN | {"batches"},
 }
 OUTSIDE = {
     "libsumo": {"traffic"},
@@ -39,37 +41,84 @@ OUTSIDE = {
     "traci": {"traffic"},
     "casadi": {"planning"},
 }
+NOBODY_NEEDS = {"cli", "report", "__main__"}
+"""Rooms that only the command line opens."""
+
+
+def files() -> dict[str, Path]:
+    """All modules by name within the package."""
+    found = {}
+    for path in PACKAGE.rglob("*.py"):
+        if "data" not in path.relative_to(PACKAGE).parts:
+            parts = path.relative_to(PACKAGE).with_suffix("").parts
+            found[".".join(parts[:-1] if parts[-1] == "__init__" and parts[1:] else parts)] = path
+    return found
+
+
+FILES = files()
+
+
+def for_types_only(node: ast.AST) -> bool:
+    return isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test)
 
 
 def imports(path: Path) -> set[str]:
-    names = set()
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    """Names that a module imports when it runs, within functions too."""
+    names: set[str] = set()
+    left: list[ast.AST] = [ast.parse(path.read_text(encoding="utf-8"))]
+    while left:
+        node = left.pop()
         if isinstance(node, ast.Import):
             names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module:
-            names.add(node.module)
+            names |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
+        if not for_types_only(node):
+            left += ast.iter_child_nodes(node)
     return names
 
 
-def room(path: Path) -> str:
-    return path.relative_to(PACKAGE).parts[0].removesuffix(".py")
+@cache
+def own_imports(module: str) -> frozenset[str]:
+    """Modules of the package that one imports."""
+    names = {n.removeprefix("sumo_cohesion.") for n in imports(FILES[module])}
+    return frozenset(names & set(FILES))
 
 
-@pytest.mark.parametrize("path", sorted(PACKAGE.rglob("*.py")), ids=lambda p: str(p.name))
-def test_imports_go_one_way(path: Path) -> None:
-    own = room(path)
-    for name in imports(path):
-        parts = name.split(".")
-        if parts[0] == "sumo_cohesion" and len(parts) > 1 and parts[1] != own:
-            assert parts[1] in ALLOWED[own], f"{own} imports {name}"
-        if parts[0] in OUTSIDE:
-            assert own in OUTSIDE[parts[0]], f"{own} imports {name}"
+def loaded(module: str) -> set[str]:
+    """Modules of the package that importing and calling one can load."""
+    found: set[str] = set()
+    left = [module]
+    while left:
+        for name in own_imports(left.pop()) - found:
+            found.add(name)
+            left.append(name)
+    return found
 
 
-def test_metrics_and_statistics_see_tables_only() -> None:
-    for name in ("metrics", "intervals", "columns"):
-        inside = {n for n in imports(PACKAGE / "tables" / f"{name}.py") if "sumo_cohesion" in n}
-        assert inside <= {"sumo_cohesion.tables.columns", "sumo_cohesion.state"}
+def room(module: str) -> str:
+    return module.partition(".")[0]
+
+
+@pytest.mark.parametrize("module", sorted(FILES))
+def test_a_room_loads_only_what_it_may(module: str) -> None:
+    own = room(module)
+    rooms = {room(name) for name in loaded(module)} - {own}
+    assert rooms <= ALLOWED[own], f"{module} loads {sorted(rooms - ALLOWED[own])}"
+    for name in imports(FILES[module]):
+        outside = name.partition(".")[0]
+        assert own in OUTSIDE.get(outside, {own}), f"{module} imports {outside}"
+    if own not in ("cli", "__main__"):
+        assert not rooms & NOBODY_NEEDS
+
+
+def test_no_two_modules_need_each_other() -> None:
+    circles = [name for name in FILES if name in loaded(name)]
+    assert circles == []
+
+
+def run_python(code: str) -> str:
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    return done.stdout.strip()
 
 
 def test_importing_the_package_loads_neither_sumo_nor_casadi() -> None:
@@ -78,12 +127,26 @@ def test_importing_the_package_loads_neither_sumo_nor_casadi() -> None:
         "heavy = {'libsumo', 'sumolib', 'casadi', 'pandas', 'matplotlib', 'scipy'};"
         "print(sorted(heavy & set(sys.modules)))"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
+    assert run_python(code) == "[]"
 
 
-def test_the_loop_fits_a_screen() -> None:
-    tree = ast.parse((PACKAGE / "simulation" / "run.py").read_text(encoding="utf-8"))
-    (loop,) = [n for n in tree.body if isinstance(n, ast.FunctionDef) and n.name == "simulate"]
+def test_reading_a_saved_run_loads_a_handful_of_modules() -> None:
+    code = (
+        "import sys; from sumo_cohesion import Rollout;"
+        "print(len([m for m in sys.modules if m.startswith('sumo_cohesion')]),"
+        "sorted({'libsumo', 'sumolib', 'casadi', 'pydantic', 'scipy'} & set(sys.modules)))"
+    )
+    count, _, heavy = run_python(code).partition(" ")
+    assert int(count) <= 10
+    assert heavy == "[]"
+
+
+@pytest.mark.parametrize(
+    ("module", "function", "lines"),
+    [("simulation.run", "drive", 40), ("simulation.episode", "step", 50)],
+)
+def test_the_loop_fits_a_screen(module: str, function: str, lines: int) -> None:
+    tree = ast.parse(FILES[module].read_text(encoding="utf-8"))
+    (loop,) = [n for n in ast.walk(tree) if isinstance(n, ast.FunctionDef) and n.name == function]
     assert loop.end_lineno is not None
-    assert loop.end_lineno - loop.lineno + 1 <= 40
+    assert loop.end_lineno - loop.lineno + 1 <= lines

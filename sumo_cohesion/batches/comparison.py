@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
-from urllib.parse import quote
 
 import pandas as pd
 
@@ -20,12 +18,12 @@ from sumo_cohesion.simulation.request import RunRequest
 from sumo_cohesion.simulation.run import simulate
 from sumo_cohesion.simulation.setup import prepare
 from sumo_cohesion.state import EGO
+from sumo_cohesion.tables.compared import COMPARISON_FILE, run_folder
 from sumo_cohesion.tables.folders import keep, require_replaceable, whole_folder
 from sumo_cohesion.tables.intervals import summarize
 from sumo_cohesion.tables.metrics import deviation
 from sumo_cohesion.tables.rollout import RUN_FILE
 
-COMPARISON_FILE = "comparison.json"
 Progress = Callable[[int, int], None]
 """Called with (runs done, runs in all)."""
 
@@ -123,18 +121,6 @@ def compare(
         }
         (new / COMPARISON_FILE).write_text(json.dumps(about, indent=2) + "\n", encoding="utf-8")
     return comparison
-
-
-_LONGEST = 150
-"""Characters of a folder's name."""
-
-
-def run_folder(folder: Path, planner: str, seed: int) -> Path:
-    """Folder of one run within a comparison's folder."""
-    name = quote(planner.replace(":", ".", 1), safe="()=', ")
-    if len(name) > _LONGEST:
-        name = f"{name[:_LONGEST]}-{hashlib.sha256(name.encode()).hexdigest()[:8]}"
-    return folder / name / f"seed_{seed:04d}"
 
 
 def _compared(jobs: Sequence[_Job], results: Sequence[_Result], folder: Path | None) -> Comparison:

@@ -23,6 +23,7 @@ from pydantic import (
 )
 
 from sumo_cohesion.batches.identity import point_digest, run_key
+from sumo_cohesion.batches.store import Value, as_cell
 from sumo_cohesion.errors import UserError
 from sumo_cohesion.planning.registry import check_planner
 from sumo_cohesion.simulation.request import RunRequest
@@ -32,7 +33,6 @@ from sumo_cohesion.user_input import parse_seeds, read_toml, validated
 
 Kept = Literal["ego", "trajectory", "plan", "horizon", "agreement", "timing", "reference"]
 """Tables that can be kept per run; ``ego`` is the ego's part of the trajectory."""
-Value = bool | int | float | str | list[Any]
 MOST_POINTS, MOST_RUNS = 20_000, 5_000_000
 """Largest experiment: a mistake in a grid should be a line, not a night of silence."""
 
@@ -220,15 +220,6 @@ def spell_out(experiment: Experiment) -> Work:
     for text in ("run", "scenario", "planner"):
         plan[text] = plan[text].astype("string")
     return Work(plan, points)
-
-
-def as_cell(value: Value) -> bool | int | float | str:
-    """Return a grid value as a table holds it: lists as text.
-
-    >>> as_cell([2, 5]), as_cell(0.5)
-    ('[2, 5]', 0.5)
-    """
-    return json.dumps(value, default=str) if isinstance(value, list) else value
 
 
 def flatten(data: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import pandas as pd
 
 from sumo_cohesion.batches.identity import point_digest, run_key
+from sumo_cohesion.batches.store import table_file
 from sumo_cohesion.errors import InputsChangedError, StorageError
 from sumo_cohesion.simulation.request import RunRequest
 from sumo_cohesion.simulation.run import simulate
@@ -65,11 +66,6 @@ def drive(job: Job) -> dict[str, Any]:
         reason = f"no plan in {len(failed)} of {len(rollout.plan)} steps, first: {first}"
     metrics = {str(name): value for name, value in row.items()}
     return {"reason": reason, "wall_time": perf_counter() - start, **metrics}
-
-
-def table_file(folder: Path, name: str, run: str) -> Path:
-    """File of one kept table of one run."""
-    return folder / "tables" / name / f"{run}.parquet"
 
 
 def _keep(rollout: Rollout, name: str, path: Path) -> None:

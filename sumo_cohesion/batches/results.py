@@ -9,9 +9,14 @@ from typing import Any
 
 import pandas as pd
 
-from sumo_cohesion.batches.experiment import as_cell
-from sumo_cohesion.batches.job import table_file
-from sumo_cohesion.batches.store import is_batch, joined, read_parquet, wanted
+from sumo_cohesion.batches.store import (
+    as_cell,
+    is_batch,
+    joined,
+    read_parquet,
+    table_file,
+    wanted,
+)
 from sumo_cohesion.errors import UserError
 from sumo_cohesion.tables.metrics import deviation
 from sumo_cohesion.tables.rollout import RUN_FILE

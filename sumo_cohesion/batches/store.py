@@ -25,7 +25,6 @@ from typing import IO, Any
 
 import pandas as pd
 
-from sumo_cohesion.batches.job import table_file
 from sumo_cohesion.errors import StorageError, UserError
 from sumo_cohesion.locks import alone
 from sumo_cohesion.tables.columns import BATCH
@@ -44,6 +43,24 @@ _DTYPES = {c.name: c.dtype for c in BATCH} | {
 }
 NOT_REPEATABLE = ("attempts", "wall_time", "plan_ms_median", "plan_ms_p99")
 """Columns that differ between two runs of the same key: times."""
+
+
+Value = bool | int | float | str | list[Any]
+"""A value of a grid."""
+
+
+def table_file(folder: Path, name: str, run: str) -> Path:
+    """File of one kept table of one run."""
+    return folder / "tables" / name / f"{run}.parquet"
+
+
+def as_cell(value: Value) -> bool | int | float | str:
+    """Return a grid value as a table holds it: lists as text.
+
+    >>> as_cell([2, 5]), as_cell(0.5)
+    ('[2, 5]', 0.5)
+    """
+    return json.dumps(value, default=str) if isinstance(value, list) else value
 
 
 class Store:

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pandas as pd
 
-from sumo_cohesion.batches.comparison import COMPARISON_FILE, run_folder
 from sumo_cohesion.errors import UserError
 from sumo_cohesion.report import drawing
 from sumo_cohesion.report.drawing import ego_of
+from sumo_cohesion.tables.compared import COMPARISON_FILE, run_folder
 from sumo_cohesion.tables.folders import claim
 from sumo_cohesion.tables.rollout import Rollout
 
