@@ -54,12 +54,19 @@ NO_LIMITS = Limits(float("inf"), float("inf"))
 
 
 class CallFailedError(Exception):
-    """A call that gave no result: how it ended (``kind``) and one line that says why."""
+    """A call that gave no result: how it ended (``kind``) and one line that says why.
 
-    def __init__(self, kind: Kind, reason: str) -> None:
-        super().__init__(reason)
+    ``signal`` is the number of the one that ended the process; 0 if none did.
+    """
+
+    def __init__(self, kind: Kind, reason: str, signal: int = 0) -> None:
+        super().__init__(kind, reason, signal)  # all of it, so that it can be sent elsewhere
         self.kind = kind
         self.reason = " ".join(reason.split())
+        self.signal = signal
+
+    def __str__(self) -> str:
+        return self.reason
 
 
 class _Answer(NamedTuple):
@@ -74,11 +81,16 @@ class Workers:
     """Calls one function, ``module:name``, in processes of their own.
 
     Safe to use from many threads: each call has a process to itself, made when none is idle.
+    What the processes print is thrown away, but for the last words of those that die, unless they
+    are ``heard``: then it goes where this process's errors go.
     """
 
-    def __init__(self, task: str, limits: Limits, paths: Sequence[str] = ()) -> None:
+    def __init__(
+        self, task: str, limits: Limits, paths: Sequence[str] = (), *, heard: bool = False
+    ) -> None:
         self._task = task
         self._limits = limits
+        self._heard = heard
         self._paths = tuple(paths) or search_paths()
         self._idle: list[_Process] = []
         self._all: set[_Process] = set()
@@ -120,7 +132,7 @@ class Workers:
             if self._closed:
                 raise CallFailedError("crash", "the workers have been closed")
             # Known before it is ready, so that close() can end it while it starts.
-            process = _Process(self._task, self._paths)
+            process = _Process(self._task, self._paths, heard=self._heard)
             self._all.add(process)
         try:
             process.wait_until_ready(self._limits.memory)
@@ -153,6 +165,16 @@ def _value(answer: _Answer, limits: Limits) -> Any:
         if answer.error == kind.__name__:
             raise kind(answer.value)
     raise CallFailedError("error", answer.value)
+
+
+def call_apart(task: str, *arguments: Any) -> Any:
+    """Call a task once, in a process of its own; what it prints is heard. Raises as Workers do."""
+    workers = Workers(task, NO_LIMITS, heard=True)
+    with stopped_by_signals():
+        try:
+            return workers.call(*arguments)
+        finally:
+            workers.close()
 
 
 def search_paths() -> tuple[str, ...]:
@@ -188,7 +210,7 @@ path, where users may have modules of any name."""
 class _Process:
     """One process, the two pipes to it, and whatever it starts."""
 
-    def __init__(self, task: str, paths: Sequence[str]) -> None:
+    def __init__(self, task: str, paths: Sequence[str], *, heard: bool) -> None:
         self.calls = 0
         self._task = task
         self._paths = tuple(paths)
@@ -203,7 +225,7 @@ class _Process:
             [sys.executable, "-P", "-c", _START, sumo_cohesion.__file__],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
-            stderr=self._said,
+            stderr=None if heard else self._said,
             env={**single, **os.environ, "TMPDIR": self._folder},
             start_new_session=True,
         )
@@ -250,7 +272,7 @@ class _Process:
             if expired.is_set():
                 reason = f"no result after {limits.seconds:g} s"
                 raise CallFailedError("timeout", reason) from None
-            raise CallFailedError("crash", self._death()) from None
+            raise self._death() from None
         finally:
             timer.cancel()
         if expired.is_set():  # in time, but killed all the same: not to be used again
@@ -258,17 +280,18 @@ class _Process:
         self._said.truncate(0)
         return answer
 
-    def _death(self) -> str:
+    def _death(self) -> CallFailedError:
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._process.wait(timeout=10)
-        status = self._process.returncode
+        status, number = self._process.returncode, 0
         if status is not None and status < 0:
-            name = signal.Signals(-status)
-            how = f"killed by {name.name} ({(signal.strsignal(name) or '').lower()})"
+            number = signal.Signals(-status)
+            how = f"killed by {number.name} ({(signal.strsignal(number) or '').lower()})"
         else:
             how = f"exit status {status}"
         words = self._last_words()
-        return f"the worker process died: {how}" + (f"; it said {words!r}" if words else "")
+        said = f"; it said {words!r}" if words else ""
+        return CallFailedError("crash", f"the worker process died: {how}{said}", number)
 
     def _last_words(self) -> str:
         with contextlib.suppress(ValueError):  # closed by kill() meanwhile

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import pickle
 import signal
 import subprocess
 import sys
@@ -141,3 +142,15 @@ def test_modules_of_any_name_in_the_users_folder_break_no_worker(tmp_path: Path)
     )
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "results" / "stalled" / "comparison.json").is_file()
+
+
+def test_why_a_call_failed_can_be_sent_elsewhere() -> None:
+    """Dask does so with what a run on another machine came to."""
+    failure = CallFailedError("crash", "killed by SIGSEGV", signal.SIGSEGV)
+    again = pickle.loads(pickle.dumps(failure))
+    assert (again.kind, again.reason, again.signal, str(again)) == (
+        "crash",
+        "killed by SIGSEGV",
+        signal.SIGSEGV,
+        "killed by SIGSEGV",
+    )
