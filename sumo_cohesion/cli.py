@@ -110,8 +110,8 @@ def _lost(error: CallFailedError, scenario: str, planner: str) -> UserError | Si
     who = f"planner {planner!r} (try --planner nominal) or SUMO" if own else "SUMO"
     return UserError(
         f"{who} crashed on these files: {error.reason}; to see whether SUMO does so by itself: "
-        f"sumo-cohesion scenario export {scenario} --out x, sumo -c x/scenario.sumocfg; then rebuild "
-        "the network with netconvert, or take routes and additional files out one by one"
+        f"sumo-cohesion scenario export {scenario} --out x, sumo -c x/scenario.sumocfg; then "
+        "rebuild the network with netconvert, or take routes and additional files out one by one"
     )
 
 
