@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import signal
 import sys
 import time
 from collections import Counter
@@ -22,6 +23,9 @@ from sumo_cohesion.errors import SimulationError, UserError
 
 if TYPE_CHECKING:
     import pandas as pd
+
+    from sumo_cohesion.batches.single import Driven
+    from sumo_cohesion.batches.workers import CallFailedError
 
 PLANNER_HELP = "nominal, cohesive, paper, sumo, or your own as module:Class(gain=2.5)."
 _SIDE_BY_SIDE = 4
@@ -66,26 +70,49 @@ def run(
     as_json: bool,
 ) -> None:
     """Drive SCENARIO (a bundled name or a TOML file) once."""
-    from sumo_cohesion.simulation.run import run as run_once
-
-    with _clean_stdout():
-        rollout = run_once(scenario, planner, seed, overrides=_overrides(changes), out=out, gui=gui)
-    _warn_of_failures(rollout.plan)
-    lights = rollout.info["traffic_lights"]
-    if lights and planner != "sumo":
-        click.echo(
-            f"note: the ego's route passes {len(lights)} traffic lights, which its planner does "
-            "not know and does not stop at",
-            err=True,
-        )
-    row = _records(rollout.metrics)[0]
+    driven = _drive(scenario, planner, seed, _overrides(changes), out, gui)
+    for note in driven.notes:
+        click.echo(f"note: {note}", err=True)
     if as_json:
-        click.echo(json.dumps({"metrics": row}, ensure_ascii=False))
+        click.echo(json.dumps({"metrics": driven.metrics}, ensure_ascii=False))
     else:
-        for name, value in row.items():
+        for name, value in driven.metrics.items():
             click.echo(f"{name:26} {_shown(value)}")
     if out is not None:
         click.echo(f"tables written to {out}", err=True)
+
+
+def _drive(
+    scenario: str, planner: str, seed: int, overrides: dict[str, Any], out: Path | None, gui: bool
+) -> Driven:
+    """Drive in a process of its own, so that what crashes SUMO is an error like others.
+
+    The window is shown from this process: SUMO's own is another anyway.
+    """
+    from sumo_cohesion.batches.single import TASK, drive
+    from sumo_cohesion.batches.workers import CallFailedError, call_apart
+
+    if gui:
+        with _clean_stdout():
+            return drive(scenario, planner, seed, overrides, out, gui=True)
+    try:
+        driven: Driven = call_apart(TASK, scenario, planner, seed, overrides, out)
+    except CallFailedError as error:
+        raise _lost(error, scenario, planner) from None
+    return driven
+
+
+def _lost(error: CallFailedError, scenario: str, planner: str) -> UserError | SimulationError:
+    """Say what to do about a run whose process gave no result."""
+    own = ":" in planner
+    if error.kind != "crash" or error.signal == signal.SIGKILL or not (error.signal or own):
+        return SimulationError(error.reason)
+    who = f"planner {planner!r} (try --planner nominal) or SUMO" if own else "SUMO"
+    return UserError(
+        f"{who} crashed on these files: {error.reason}; to see whether SUMO does so by itself: "
+        f"sumo-cohesion scenario export {scenario} --out x, sumo -c x/scenario.sumocfg; then "
+        "rebuild the network with netconvert, or take routes and additional files out one by one"
+    )
 
 
 @app.command()
@@ -356,16 +383,6 @@ def _shown(value: object) -> str:
     if value is None:
         return "-"
     return f"{value:.3f}" if isinstance(value, float) else str(value)
-
-
-def _warn_of_failures(plan: pd.DataFrame) -> None:
-    failed = plan[plan["fallback"]]
-    if len(failed):
-        click.echo(
-            f"note: the planner failed in {len(failed)} of {len(plan)} steps, first with "
-            f"{failed['status'].iloc[0]!r}; the ego braked in its lane instead",
-            err=True,
-        )
 
 
 def _print_summary(summary: pd.DataFrame) -> None:

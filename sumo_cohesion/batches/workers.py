@@ -2,7 +2,12 @@
 
 Pools of the standard library and of joblib break as a whole when one of their processes dies, and
 know no time limit. Here each process does one call at a time, for a thread that waits for it, so
-that it is always known which call a lost process was doing.
+that it is always known which call a lost process was doing. pebble's ProcessPool has time limits
+and survives lost processes, too; but it starts them by ``spawn``, which imports the user's main
+script again, so that one without a ``__main__`` guard could not call compare().
+
+A process and what it starts are a group of their own, and end together. A process finds the
+standard library and what is installed before the user's own modules, whatever these are called.
 """
 
 from __future__ import annotations
@@ -15,6 +20,7 @@ import pickle
 import queue
 import shutil
 import signal
+import site
 import struct
 import subprocess
 import sys
@@ -25,8 +31,9 @@ from collections.abc import Callable, Sequence
 from functools import lru_cache
 from pathlib import Path
 from types import FrameType
-from typing import IO, Any, Literal, NamedTuple
+from typing import IO, Any, Literal, NamedTuple, NoReturn
 
+import sumo_cohesion
 from sumo_cohesion.errors import InputsChangedError, SimulationError, StorageError, UserError
 
 Kind = Literal["crash", "timeout", "memory", "error"]
@@ -47,12 +54,19 @@ NO_LIMITS = Limits(float("inf"), float("inf"))
 
 
 class CallFailedError(Exception):
-    """A call that gave no result: how it ended (``kind``) and one line that says why."""
+    """A call that gave no result: how it ended (``kind``) and one line that says why.
 
-    def __init__(self, kind: Kind, reason: str) -> None:
-        super().__init__(reason)
+    ``signal`` is the number of the one that ended the process; 0 if none did.
+    """
+
+    def __init__(self, kind: Kind, reason: str, signal: int = 0) -> None:
+        super().__init__(kind, reason, signal)  # all of it, so that it can be sent elsewhere
         self.kind = kind
         self.reason = " ".join(reason.split())
+        self.signal = signal
+
+    def __str__(self) -> str:
+        return self.reason
 
 
 class _Answer(NamedTuple):
@@ -67,11 +81,16 @@ class Workers:
     """Calls one function, ``module:name``, in processes of their own.
 
     Safe to use from many threads: each call has a process to itself, made when none is idle.
+    What the processes print is thrown away, but for the last words of those that die, unless they
+    are ``heard``: then it goes where this process's errors go.
     """
 
-    def __init__(self, task: str, limits: Limits, paths: Sequence[str] = ()) -> None:
+    def __init__(
+        self, task: str, limits: Limits, paths: Sequence[str] = (), *, heard: bool = False
+    ) -> None:
         self._task = task
         self._limits = limits
+        self._heard = heard
         self._paths = tuple(paths) or search_paths()
         self._idle: list[_Process] = []
         self._all: set[_Process] = set()
@@ -113,7 +132,7 @@ class Workers:
             if self._closed:
                 raise CallFailedError("crash", "the workers have been closed")
             # Known before it is ready, so that close() can end it while it starts.
-            process = _Process(self._task, self._paths)
+            process = _Process(self._task, self._paths, heard=self._heard)
             self._all.add(process)
         try:
             process.wait_until_ready(self._limits.memory)
@@ -140,11 +159,22 @@ def _value(answer: _Answer, limits: Limits) -> Any:
     if not answer.error:
         return answer.value
     if answer.error == "memory":
-        raise CallFailedError("memory", f"needed more than {limits.memory:g} GB of memory")
+        most = f"{limits.memory:g} GB of memory" if limits.memory < float("inf") else "there is"
+        raise CallFailedError("memory", f"needed more than {most}")
     for kind in (InputsChangedError, StorageError, UserError, SimulationError):
         if answer.error == kind.__name__:
             raise kind(answer.value)
     raise CallFailedError("error", answer.value)
+
+
+def call_apart(task: str, *arguments: Any) -> Any:
+    """Call a task once, in a process of its own; what it prints is heard. Raises as Workers do."""
+    workers = Workers(task, NO_LIMITS, heard=True)
+    with stopped_by_signals():
+        try:
+            return workers.call(*arguments)
+        finally:
+            workers.close()
 
 
 def search_paths() -> tuple[str, ...]:
@@ -165,31 +195,45 @@ def call_here(task: str, limits: Limits, paths: tuple[str, ...], *arguments: Any
     return _workers_here(task, limits, paths).call(*arguments)
 
 
-class _Process:
-    """One process and the two pipes to it."""
+_START = """
+import importlib.util, sys
+spec = importlib.util.spec_from_file_location("sumo_cohesion", sys.argv[1])
+sys.modules["sumo_cohesion"] = package = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(package)
+from sumo_cohesion.batches.workers import serve
+serve()
+"""
+"""A process's program. It takes this very package, wherever that lies, without its folder on the
+path, where users may have modules of any name."""
 
-    def __init__(self, task: str, paths: Sequence[str]) -> None:
+
+class _Process:
+    """One process, the two pipes to it, and whatever it starts."""
+
+    def __init__(self, task: str, paths: Sequence[str], *, heard: bool) -> None:
         self.calls = 0
         self._task = task
+        self._paths = tuple(paths)
+        self._ending, self._ended = threading.Lock(), False
         # Appended to, so that what was said can be thrown away between calls.
         self._said = tempfile.TemporaryFile("a+b")  # noqa: SIM115 - closed in kill()
         # What a killed process leaves behind goes with this folder.
         self._folder = tempfile.mkdtemp(prefix="sumo-cohesion-")
         # The matrices here are tiny: threads of the linear algebra library only fight for cores.
         single = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
-        own = {"PYTHONPATH": os.pathsep.join(paths), "TMPDIR": self._folder}
         self._process = subprocess.Popen(
-            [sys.executable, "-c", f"from {__name__} import serve; serve()"],
+            [sys.executable, "-P", "-c", _START, sumo_cohesion.__file__],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
-            stderr=self._said,
-            env={**single, **os.environ, **own},
+            stderr=None if heard else self._said,
+            env={**single, **os.environ, "TMPDIR": self._folder},
+            start_new_session=True,
         )
 
     def wait_until_ready(self, memory: float) -> None:
         """Wait until the process has imported what it needs: no part of the first call's time."""
         try:
-            _send(self._to, (self._task, memory))
+            _send(self._to, (self._task, memory, self._paths))
             _receive(self._from)
         except (OSError, EOFError, ValueError):  # ValueError: killed by close() meanwhile
             reason = self._last_words() or "it ended at once"
@@ -216,7 +260,7 @@ class _Process:
 
         def expire() -> None:
             expired.set()
-            self._process.kill()
+            self._end_group()
 
         timer = threading.Timer(min(limits.seconds, threading.TIMEOUT_MAX), expire)
         timer.daemon = True
@@ -228,7 +272,7 @@ class _Process:
             if expired.is_set():
                 reason = f"no result after {limits.seconds:g} s"
                 raise CallFailedError("timeout", reason) from None
-            raise CallFailedError("crash", self._death()) from None
+            raise self._death() from None
         finally:
             timer.cancel()
         if expired.is_set():  # in time, but killed all the same: not to be used again
@@ -236,17 +280,18 @@ class _Process:
         self._said.truncate(0)
         return answer
 
-    def _death(self) -> str:
+    def _death(self) -> CallFailedError:
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._process.wait(timeout=10)
-        status = self._process.returncode
+        status, number = self._process.returncode, 0
         if status is not None and status < 0:
-            name = signal.Signals(-status)
-            how = f"killed by {name.name} ({(signal.strsignal(name) or '').lower()})"
+            number = signal.Signals(-status)
+            how = f"killed by {number.name} ({(signal.strsignal(number) or '').lower()})"
         else:
             how = f"exit status {status}"
         words = self._last_words()
-        return f"the worker process died: {how}" + (f"; it said {words!r}" if words else "")
+        said = f"; it said {words!r}" if words else ""
+        return CallFailedError("crash", f"the worker process died: {how}{said}", number)
 
     def _last_words(self) -> str:
         with contextlib.suppress(ValueError):  # closed by kill() meanwhile
@@ -255,9 +300,22 @@ class _Process:
             return lines[-1].strip()[:200] if lines else ""
         return ""
 
+    def _end_group(self) -> None:
+        """End the process and all that it started, once: its number may then be another's."""
+        with self._ending:
+            if self._ended:
+                return
+            self._ended = True
+            try:
+                os.killpg(self._process.pid, signal.SIGKILL)
+            except ProcessLookupError:  # all have ended
+                pass
+            except (AttributeError, PermissionError):  # Windows; macOS, if all are zombies
+                self._process.kill()
+
     def kill(self) -> None:
-        """End the process, whatever it does."""
-        self._process.kill()
+        """End the process, whatever it does and has started."""
+        self._end_group()
         self._process.wait()
         for pipe in (self._to, self._from, self._said):
             with contextlib.suppress(OSError):
@@ -286,10 +344,14 @@ def _receive(pipe: IO[bytes]) -> Any:
 def serve() -> None:
     """Answer calls until the other side closes its pipe: the process's whole life."""
     calls, answers = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
+    nothing = os.open(os.devnull, os.O_RDWR)
+    os.dup2(nothing, 0)  # what a run reads must not be the calls
     os.dup2(2, 1)  # what native libraries print must not mix with the answers
+    _keep_from_children(nothing, calls.fileno(), answers.fileno())
     for number in (signal.SIGINT, signal.SIGTERM):  # Ctrl-C and the like are the parent's to handle
         signal.signal(number, signal.SIG_IGN)
-    task, memory = _receive(calls)
+    task, memory, paths = _receive(calls)
+    sys.path[:] = _installed_first([*paths, *sys.path])
     _limit_memory(memory)
     module, _, name = task.partition(":")
     function = getattr(importlib.import_module(module), name)
@@ -301,7 +363,7 @@ def serve() -> None:
         with contextlib.suppress(OSError, EOFError):
             while True:
                 inbox.put(_receive_bytes(calls))
-        os._exit(0)
+        _end()
 
     threading.Thread(target=read, daemon=True).start()
     while True:
@@ -309,7 +371,34 @@ def serve() -> None:
         try:
             _send(answers, answer)
         except BrokenPipeError:
-            os._exit(0)
+            _end()
+
+
+def _installed_first(paths: Sequence[str]) -> list[str]:
+    """Put the standard library and what is installed first, and keep the order of the rest."""
+    homes = [Path(p) for p in (sys.prefix, sys.base_prefix, site.getusersitepackages())]
+    return sorted(
+        dict.fromkeys(paths), key=lambda path: not any(Path(path).is_relative_to(h) for h in homes)
+    )
+
+
+def _end() -> NoReturn:
+    """End this process and all that it started."""
+    with contextlib.suppress(AttributeError):  # Windows
+        if os.getpgrp() == os.getpid():  # a group of its own
+            os.killpg(0, signal.SIGKILL)
+    os._exit(0)
+
+
+def _keep_from_children(nothing: int, *pipes: int) -> None:
+    """See to it that no forked child holds a pipe, so that its end is this process's end."""
+
+    def let_go() -> None:
+        for pipe in pipes:
+            os.dup2(nothing, pipe)
+
+    with contextlib.suppress(AttributeError):  # Windows
+        os.register_at_fork(after_in_child=let_go)
 
 
 def _answer(function: Callable[..., Any], call: bytes) -> _Answer:

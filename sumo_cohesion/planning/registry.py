@@ -122,10 +122,11 @@ def parse_planner(name: str) -> OwnPlanner:
 
 def _load_planner(name: str) -> Planner:
     module_name, class_name, arguments = parse_planner(name)
-    # A user's module usually lies in the folder they work in.
+    # A user's module usually lies in the folder they work in. It comes last: what else lies there
+    # may have any name, that of a module of the standard library, too.
     here = str(Path.cwd())
     if here not in sys.path:
-        sys.path.insert(0, here)
+        sys.path.append(here)
     try:
         module = importlib.import_module(module_name)
     except (Exception, SystemExit) as error:

@@ -6,7 +6,8 @@ Network file format: https://sumo.dlr.de/docs/Networks/SUMO_Road_Networks.html
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -18,11 +19,14 @@ from scipy.ndimage import gaussian_filter1d
 from sumo_cohesion.errors import UserError
 from sumo_cohesion.road import SPACING, Road
 from sumo_cohesion.state import FloatArray, IntArray
+from sumo_cohesion.traffic.network_check import check_network
 
 EXTENSION = 100.0
 """Straight metres added to both ends of the reference line, so that cars near them project."""
 _APART = round(100.0 / SPACING)
 """Vertices between two exits in one column: farther than from one car to another in its lane."""
+LONGEST_ROUTE = 300_000.0
+"""Metres of the ego's route at most: its road takes half a gigabyte then."""
 SMOOTHING = 4.0
 """Standard deviation (m) of the filter that rounds the kinks of a polyline. It moves a curve of
 radius R inwards by SMOOTHING²/2R (2 cm at 400 m); the lanes, measured in the same frame, are
@@ -65,7 +69,7 @@ class Network:
     def __init__(self, path: Path) -> None:
         import sumolib
 
-        check_xml(path, "net")
+        check_network(check_xml(path, "net"), path)
         self.path = path
         try:
             self._net: Any = sumolib.net.readNet(str(path), withInternal=True)
@@ -96,9 +100,9 @@ class Network:
 
     def route(self, origin: str, destination: str) -> list[str]:
         """Edges of the shortest route for cars between two edges, both included."""
-        path, _ = self._net.getShortestPath(
-            self._edge(origin), self._edge(destination), vClass="passenger"
-        )
+        first, last = self._edge(origin), self._edge(destination)
+        with self._readable(f"from edge {origin!r} to edge {destination!r}"):
+            path, _ = self._net.getShortestPath(first, last, vClass="passenger")
         if path is None:
             raise UserError(
                 f"{self.path}: no way for a car from edge {origin!r} to edge {destination!r}"
@@ -118,9 +122,23 @@ class Network:
     def road(self, route: Sequence[str]) -> Road:
         """Build the Road along a route; its s = 0 is the start of the first edge."""
         edges = [self._edge(e) for e in route]
-        chain = self._lane_chain(edges)
-        line = _reference_line(self._chain_shape(chain))
-        return self._with_lanes(_bare_road(line), edges)
+        with self._readable(f"along the route from edge {route[0]!r} to edge {route[-1]!r}"):
+            chain = self._lane_chain(edges)
+            line = _reference_line(self._chain_shape(chain))
+            return self._with_lanes(_bare_road(line), edges)
+
+    @contextmanager
+    def _readable(self, where: str) -> Iterator[None]:
+        """Turn whatever a network that makes no sense causes into one line."""
+        try:
+            yield
+        except UserError:
+            raise
+        except Exception as error:
+            raise UserError(
+                f"{self.path}: no road can be made of it {where} ({type(error).__name__}: "
+                f"{error}); rebuild the network with netconvert"
+            ) from None
 
     def _edge(self, edge: str) -> Any:
         if not self._net.hasEdge(edge) or self._net.getEdge(edge).getFunction() == "internal":
@@ -278,6 +296,11 @@ def _reference_line(points: FloatArray) -> FloatArray:
     length = _arc_length(points)[-1]
     if length < 3 * SPACING:
         raise UserError("the ego's route is shorter than 3 m; choose another destination")
+    if length > LONGEST_ROUTE:
+        raise UserError(
+            f"the ego's route is {length / 1e3:.0f} km long, more than {LONGEST_ROUTE / 1e3:g} km; "
+            "choose another destination"
+        )
     line = _resample(points, round(length / SPACING) + 1)
     head, tail = line[0] - line[1], line[-1] - line[-2]
     steps = np.arange(1.0, EXTENSION / SPACING + 1)[:, None]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import shutil
 import stat
@@ -12,17 +13,28 @@ from pathlib import Path
 import pytest
 
 from sumo_cohesion import cli
+from sumo_cohesion.batches import workers
 from tests.conftest import ROOT
 
 Invoke = Callable[..., tuple[int, str, str]]
+
+
+def call_here(task: str, *arguments: object) -> object:
+    """Call a task as workers.call_apart does, but here."""
+    module, _, name = task.partition(":")
+    return getattr(importlib.import_module(module), name)(*arguments)
 
 
 @pytest.fixture
 def invoke(
     capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> Invoke:
-    """Call the command line in an empty folder: (status, stdout, stderr)."""
+    """Call the command line in an empty folder: (status, stdout, stderr).
+
+    In this one process, which is quicker; test_own_process.py has the rest.
+    """
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(workers, "call_apart", call_here)
 
     def call(*arguments: str) -> tuple[int, str, str]:
         monkeypatch.setattr(sys, "argv", ["sumo-cohesion", *map(str, arguments)])

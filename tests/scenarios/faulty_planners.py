@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import os
 import time
 from pathlib import Path
 
@@ -85,3 +86,28 @@ class RaisesNonsense(Good):
 class CannotBeMade(Good):
     def __init__(self) -> None:
         raise ValueError("no")
+
+
+class Exits(Good):
+    def fail(self) -> None:
+        os._exit(3)
+
+
+class Prints(Good):
+    def plan(self, observation: Observation, history: History) -> Plan:
+        print("thinking")
+        return super().plan(observation, history)
+
+
+class Tells(Good):
+    """Writes down its process once it drives, and then takes for ever."""
+
+    def __init__(self, file: str) -> None:
+        self.file = Path(file)
+
+    def fail(self) -> None:
+        new = self.file.with_suffix(".new")
+        new.write_text(str(os.getpid()))
+        new.rename(self.file)
+        while True:
+            time.sleep(0.01)
