@@ -1,0 +1,125 @@
+"""Commands that drive: one run, and several planners on the same seeds."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from sumo_cohesion.cli.terminal import (
+    PLANNER_HELP,
+    SET_HELP,
+    clean_stdout,
+    parsed_overrides,
+    print_summary,
+    progress_bar,
+    records,
+    shown,
+)
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+@click.command()
+@click.argument("scenario")
+@click.option("--planner", default="cohesive", show_default=True, help=PLANNER_HELP)
+@click.option("--seed", type=int, default=0, show_default=True, help="Varies the traffic.")
+@click.option("--set", "changes", multiple=True, metavar="NAME=VALUE", help=SET_HELP)
+@click.option("--out", type=click.Path(path_type=Path), help="Folder for the run's tables.")
+@click.option("--gui", is_flag=True, help="Show SUMO's window (needs sumo-cohesion[gui]).")
+@click.option("--json", "as_json", is_flag=True, help="Print the metrics as JSON.")
+def run(
+    scenario: str,
+    planner: str,
+    seed: int,
+    changes: tuple[str, ...],
+    out: Path | None,
+    gui: bool,
+    as_json: bool,
+) -> None:
+    """Drive SCENARIO (a bundled name or a TOML file) once."""
+    from sumo_cohesion.simulation.run import run as run_once
+
+    with clean_stdout():
+        rollout = run_once(
+            scenario, planner, seed, overrides=parsed_overrides(changes), out=out, gui=gui
+        )
+    _warn_of_failures(rollout.plan)
+    lights = rollout.info["traffic_lights"]
+    if lights and planner != "sumo":
+        click.echo(
+            f"note: the ego's route passes {len(lights)} traffic lights, which its planner does "
+            "not know and does not stop at",
+            err=True,
+        )
+    row = records(rollout.metrics)[0]
+    if as_json:
+        click.echo(json.dumps({"metrics": row}, ensure_ascii=False))
+    else:
+        for name, value in row.items():
+            click.echo(f"{name:26} {shown(value)}")
+    if out is not None:
+        click.echo(f"tables written to {out}", err=True)
+
+
+@click.command()
+@click.argument("scenario")
+@click.option("--planners", default="nominal,cohesive", show_default=True, help=PLANNER_HELP)
+@click.option("--seeds", default="0:20", show_default=True, help="0:20 is half-open; or 3,7,9.")
+@click.option("--workers", type=click.IntRange(min=1), help="Processes. Default: one per core.")
+@click.option("--set", "changes", multiple=True, metavar="NAME=VALUE", help=SET_HELP)
+@click.option("--out", type=click.Path(path_type=Path), help="Default: results/SCENARIO.")
+@click.option("--json", "as_json", is_flag=True, help="Print runs and summary as JSON.")
+def compare(
+    scenario: str,
+    planners: str,
+    seeds: str,
+    workers: int | None,
+    changes: tuple[str, ...],
+    out: Path | None,
+    as_json: bool,
+) -> None:
+    """Run several planners on the same seeds of SCENARIO and compare them."""
+    from sumo_cohesion.batches.comparison import compare as compare_planners
+    from sumo_cohesion.report.paths import draw_comparison
+    from sumo_cohesion.user_input import parse_seeds, split_planners
+
+    folder = out if out is not None else Path("results") / Path(scenario).stem
+    names, numbers = split_planners(planners), parse_seeds(seeds)
+    with clean_stdout(), progress_bar(f"{scenario}") as progress:
+        result = compare_planners(
+            scenario,
+            names,
+            numbers,
+            overrides=parsed_overrides(changes),
+            workers=workers,
+            out=folder,
+            progress=progress,
+        )
+        picture = draw_comparison(folder)
+    for planner, failures in result.runs.groupby("planner", sort=False)["plan_failures"]:
+        if failures.any():
+            click.echo(
+                f"note: {planner} failed in {failures.sum()} steps of {(failures > 0).sum()} runs; "
+                "the table plan says why, and 'run' prints it",
+                err=True,
+            )
+    if as_json:
+        document = {"runs": records(result.runs), "summary": records(result.summary)}
+        click.echo(json.dumps(document, ensure_ascii=False))
+    else:
+        print_summary(result.summary)
+    click.echo(f"runs and tables in {folder}, picture in {picture}", err=True)
+
+
+def _warn_of_failures(plan: pd.DataFrame) -> None:
+    failed = plan[plan["fallback"]]
+    if len(failed):
+        click.echo(
+            f"note: the planner failed in {len(failed)} of {len(plan)} steps, first with "
+            f"{failed['status'].iloc[0]!r}; the ego braked in its lane instead",
+            err=True,
+        )
