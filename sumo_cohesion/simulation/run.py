@@ -13,7 +13,7 @@ from time import perf_counter
 from typing import Any
 
 from sumo_cohesion.perception.observation import Sensor
-from sumo_cohesion.planning.planners import Planner
+from sumo_cohesion.planning.planners import Planner, start
 from sumo_cohesion.planning.registry import make_planner
 from sumo_cohesion.road import Road
 from sumo_cohesion.simulation.car import END_OF_ROUTE, ask, drive
@@ -95,7 +95,7 @@ def simulate(setup: Setup, planner: Planner, *, gui: bool = False) -> Rollout:
     sensor = Sensor(road, sensing.range, sensing.hidden, sensing.special)
     history = new_history(setup.cohesion, STEP)
     recorder, fleet = Recorder(setup, sensor), Fleet(setup)
-    planner.reset(road)
+    start(planner, road)
     with (
         _older_objects_left_alone(),
         tempfile.TemporaryDirectory() as folder,
