@@ -31,7 +31,7 @@ ALLOWED = {
     "report": SHARED | {"tables", "batches"},
     "cli": {"errors", "simulation", "tables", "batches", "report", "user_input"},
     "__main__": {"cli"},
-    "__init__": {"errors", "simulation", "tables", "batches"},
+    "__init__": {"errors", "state", "planning", "simulation", "tables", "batches"},
 }
 OUTSIDE = {
     "libsumo": {"traffic"},

@@ -8,6 +8,7 @@ import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from dataclasses import dataclass
+from html import escape
 from pathlib import Path
 from typing import Any, NamedTuple
 from urllib.parse import quote
@@ -24,19 +25,33 @@ from sumo_cohesion.tables.folders import require_replaceable, whole_folder
 from sumo_cohesion.tables.intervals import summarize
 from sumo_cohesion.tables.metrics import deviation
 from sumo_cohesion.tables.rollout import RUN_FILE, Rollout
+from sumo_cohesion.user_input import parse_seeds, refuse_repeats, split_names
 
 COMPARISON_FILE = "comparison.json"
 Progress = Callable[[int, int], None]
 """Called with (runs done, runs in all)."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Comparison:
     """One metrics row per run, and rates and means with 95 % intervals per planner."""
 
     runs: pd.DataFrame
     summary: pd.DataFrame
     folder: Path | None
+
+    def __repr__(self) -> str:
+        scenario, where = (
+            self.runs["scenario"].iloc[0],
+            f", in {self.folder}" if self.folder else "",
+        )
+        successes = self.runs.groupby("planner", sort=False)["success"].agg(["sum", "count"])
+        rates = [f"{planner} {done} of {of}" for planner, done, of in successes.itertuples()]
+        more = f" and {len(rates) - 4} more" if len(rates) > 4 else ""
+        return f"<Comparison {scenario}, successes: {', '.join(rates[:4])}{more}{where}>"
+
+    def _repr_html_(self) -> str:
+        return f"<p>{escape(repr(self))}</p>{self.summary.to_html(index=False)}"
 
 
 class _Result(NamedTuple):
@@ -57,8 +72,8 @@ class _Job:
 
 def compare(
     scenario: str | Path,
-    planners: Sequence[str] = ("nominal", "cohesive"),
-    seeds: Sequence[int] = tuple(range(20)),
+    planners: str | Sequence[str] = ("nominal", "cohesive"),
+    seeds: str | Sequence[int] = "0:20",
     *,
     overrides: Mapping[str, Any] | None = None,
     workers: int | None = None,
@@ -70,8 +85,8 @@ def compare(
     Parameters
     ----------
     scenario, overrides : as for run().
-    planners : names as for run().
-    seeds : each gives all planners the same traffic.
+    planners : names as for run(); one text may hold several, separated by commas.
+    seeds : a list, a range, or "0:20" (half-open); each gives all planners the same traffic.
     workers : processes; one simulation runs in each. Default: one per processor.
     out : folder for all runs, their metrics, the summary and a picture. It must not exist, be
         empty, or hold an earlier comparison, which is replaced when all runs are done.
@@ -85,12 +100,14 @@ def compare(
         If a run or its process failed, or Ctrl-C was pressed. Finished runs are then kept in
         a folder that the message names.
     """
+    planners, seeds = _names(planners), parse_seeds(seeds, "seeds")
     if not planners or not seeds:
         raise UserError("nothing to compare: give at least one planner and one seed")
-    for name, values in (("planner", planners), ("seed", seeds)):
-        repeated = [v for v in values if list(values).count(v) > 1]
-        if repeated:
-            raise UserError(f"{name} {repeated[0]} is listed twice")
+    for what, values in (("planner", planners), ("seed", seeds)):
+        try:
+            refuse_repeats(values)
+        except ValueError as error:
+            raise UserError(f"{what} {error}") from None
     for planner in planners:
         for seed in (min(seeds), max(seeds)):
             prepare(scenario, planner, seed, overrides)
@@ -114,7 +131,7 @@ def compare(
                 raise
             kind = UserError if isinstance(error, UserError) else SimulationError
             reason = str(error) or "interrupted"
-            raise kind(f"{reason}; finished runs are kept in {kept}") from None
+            raise kind(f"{reason}; finished runs are kept in {kept}") from error.__cause__
         comparison = _compared(jobs, results, folder)
         comparison.runs.to_parquet(new / "metrics.parquet", index=False)
         comparison.summary.to_parquet(new / "summary.parquet", index=False)
@@ -126,6 +143,17 @@ def compare(
         }
         (new / COMPARISON_FILE).write_text(json.dumps(about, indent=2) + "\n", encoding="utf-8")
     return comparison
+
+
+def _names(planners: str | Sequence[str]) -> list[str]:
+    names = split_names(planners) if isinstance(planners, str) else list(planners)
+    for name in names:
+        if not isinstance(name, str):
+            raise UserError(
+                f"planner {type(name).__name__}: runs are done in other processes, which find a "
+                "planner by its name; put its class into a file and give 'file.py:Class'"
+            )
+    return names
 
 
 _LONGEST = 150

@@ -85,10 +85,10 @@ def compare(
     """Run several planners on the same seeds of SCENARIO and compare them."""
     from sumo_cohesion.batches.comparison import compare as compare_planners
     from sumo_cohesion.report.paths import draw_comparison
-    from sumo_cohesion.user_input import parse_seeds, split_planners
+    from sumo_cohesion.user_input import parse_seeds, split_names
 
     folder = out if out is not None else Path("results") / Path(scenario).stem
-    names, numbers = split_planners(planners), parse_seeds(seeds)
+    names, numbers = split_names(planners), parse_seeds(seeds)
     with clean_stdout(), progress_bar(f"{scenario}") as progress:
         result = compare_planners(
             scenario,
