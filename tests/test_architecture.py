@@ -29,7 +29,16 @@ ALLOWED = {
     | {"traffic", "perception", "social", "planning", "tables", "user_input", "versions"},
     "batches": SHARED | {"traffic", "planning", "simulation", "tables", "user_input", "versions"},
     "report": SHARED | {"tables", "batches"},
-    "cli": {"errors", "simulation", "tables", "batches", "report", "user_input"},
+    "cli": {
+        "errors",
+        "planning",
+        "simulation",
+        "tables",
+        "batches",
+        "report",
+        "user_input",
+        "versions",
+    },
     "__main__": {"cli"},
     "__init__": {"errors", "state", "planning", "simulation", "tables", "batches"},
 }

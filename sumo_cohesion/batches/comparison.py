@@ -100,7 +100,8 @@ def compare(
         If a run or its process failed, or Ctrl-C was pressed. Finished runs are then kept in
         a folder that the message names.
     """
-    planners, seeds = _names(planners), parse_seeds(seeds, "seeds")
+    planners = split_names(planners) if isinstance(planners, str) else planners
+    seeds = parse_seeds(seeds, "seeds")
     if not planners or not seeds:
         raise UserError("nothing to compare: give at least one planner and one seed")
     for what, values in (("planner", planners), ("seed", seeds)):
@@ -131,7 +132,7 @@ def compare(
                 raise
             kind = UserError if isinstance(error, UserError) else SimulationError
             reason = str(error) or "interrupted"
-            raise kind(f"{reason}; finished runs are kept in {kept}") from error.__cause__
+            raise kind(f"{reason}; finished runs are kept in {kept}") from error
         comparison = _compared(jobs, results, folder)
         comparison.runs.to_parquet(new / "metrics.parquet", index=False)
         comparison.summary.to_parquet(new / "summary.parquet", index=False)
@@ -143,17 +144,6 @@ def compare(
         }
         (new / COMPARISON_FILE).write_text(json.dumps(about, indent=2) + "\n", encoding="utf-8")
     return comparison
-
-
-def _names(planners: str | Sequence[str]) -> list[str]:
-    names = split_names(planners) if isinstance(planners, str) else list(planners)
-    for name in names:
-        if not isinstance(name, str):
-            raise UserError(
-                f"planner {type(name).__name__}: runs are done in other processes, which find a "
-                "planner by its name; put its class into a file and give 'file.py:Class'"
-            )
-    return names
 
 
 _LONGEST = 150

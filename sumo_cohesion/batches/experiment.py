@@ -206,7 +206,7 @@ def spell_out(experiment: Experiment) -> Work:
     except UserError as error:
         if not experiment._source:
             raise
-        raise UserError(f"{experiment._source}: {error}") from error.__cause__
+        raise UserError(f"{experiment._source}: {error}") from error
 
 
 def _spelt_out(experiment: Experiment) -> Work:

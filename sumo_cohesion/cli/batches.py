@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import sys
 from collections import Counter
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from sumo_cohesion.cli import options
 from sumo_cohesion.cli.terminal import clean_stdout, print_summary, progress_bar, records
 from sumo_cohesion.errors import UserError
 
@@ -20,16 +22,20 @@ if TYPE_CHECKING:
 @click.command("batch")
 @click.argument("experiment", type=click.Path(path_type=Path))
 @click.option("--out", type=click.Path(path_type=Path), help="Default: results/EXPERIMENT.")
-@click.option("--workers", type=click.IntRange(min=1), help="Processes. Default: one per core.")
+@options.workers
 @click.option("--dask", metavar="ADDRESS", help="Run on a Dask cluster; 'local' starts one here.")
 @click.option(
     "--shard", metavar="I/N", default="1/1", help="Only the I-th of N parts (job arrays)."
 )
 @click.option("--retry-failed", is_flag=True, help="Also run again what has failed before.")
+@click.option("--dry-run", is_flag=True, help="Run nothing: say how many runs there are.")
 @click.option(
-    "--dry-run", is_flag=True, help="Say how many runs there are, and how long they take."
+    "--estimate",
+    is_flag=True,
+    help="Say how long they take, too: one run of each scenario and planner is measured.",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print the runs as JSON.")
+@options.traceback
 def run_batch(
     experiment: Path,
     out: Path | None,
@@ -38,6 +44,7 @@ def run_batch(
     shard: str,
     retry_failed: bool,
     dry_run: bool,
+    estimate: bool,
     as_json: bool,
 ) -> None:
     """Do all runs of EXPERIMENT (a TOML file) that are not done yet.
@@ -48,9 +55,9 @@ def run_batch(
     from sumo_cohesion.batches.workers import processors
 
     folder = out if out is not None else Path("results") / experiment.stem
-    if dry_run:
+    if dry_run or estimate:
         with clean_stdout():
-            plan = batches.dry_run(experiment, folder)
+            plan = batches.dry_run(experiment, folder, estimate=estimate)
         _print_plan(plan, folder, workers or processors(), as_json=as_json)
         return
     failed: Counter[str] = Counter()
@@ -109,16 +116,19 @@ def _summary(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def _print_plan(plan: pd.DataFrame, folder: Path, workers: int, *, as_json: bool) -> None:
-    hours = plan["seconds"].sum() / workers / 3600
+    # One unknown time makes an unknown sum.
+    hours = plan["seconds"].sum(skipna=False) / workers / 3600
     if as_json:
-        document = {"plan": records(plan), "workers": workers, "hours": hours}
+        known = None if math.isnan(hours) else hours
+        document = {"plan": records(plan), "workers": workers, "hours": known}
         click.echo(json.dumps(document, ensure_ascii=False))
         return
-    click.echo(plan.round({"seconds": 0}).to_string(index=False))
-    click.echo(
-        f"{plan['left'].sum()} of {plan['runs'].sum()} runs are left for {folder}: about "
-        f"{_duration(3600 * hours)} with {workers} workers"
-    )
+    if math.isnan(hours):
+        plan, long = plan.drop(columns="seconds"), "; --estimate says how long they take"
+    else:
+        long = f": about {_duration(3600 * hours)} with {workers} workers"
+    click.echo(plan.round(0).to_string(index=False))
+    click.echo(f"{plan['left'].sum()} of {plan['runs'].sum()} runs are left for {folder}{long}")
 
 
 def _duration(seconds: float) -> str:

@@ -76,11 +76,29 @@ def figure(
         return
     from sumo_cohesion.report.paths import draw_comparison, draw_run
 
+    _require_one(folder)
     draw = draw_comparison if (folder / "comparison.json").is_file() else draw_run
     if draw is draw_run and seed is not None:
         raise UserError(f"{folder}: one run has one seed; leave --seed out")
     path = draw_comparison(folder, out, seed) if draw is draw_comparison else draw_run(folder, out)
     click.echo(path)
+
+
+def _require_one(folder: Path) -> None:
+    """Raise UserError unless a folder is that of a comparison or of one run."""
+    from sumo_cohesion.batches.comparison import COMPARISON_FILE
+    from sumo_cohesion.tables.rollout import RUN_FILE
+
+    if (folder / COMPARISON_FILE).is_file() or (folder / RUN_FILE).is_file():
+        return
+    wanted = "give a folder that run, compare or batch wrote with --out"
+    if not folder.is_dir():
+        raise UserError(f"{folder}: no such folder; {wanted}")
+    for file, kind in ((COMPARISON_FILE, "comparisons"), (RUN_FILE, "runs")):
+        if found := sorted(path.parent for path in folder.rglob(file)):
+            several = f"{len(found)} {kind}" if len(found) > 1 else f"one of the {kind}"
+            raise UserError(f"{folder}: {several} lie below; name one, e.g. {found[0]}")
+    raise UserError(f"{folder}: no run there; {wanted}")
 
 
 @contextmanager

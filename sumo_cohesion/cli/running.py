@@ -4,33 +4,37 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal, get_args
 
 import click
 
-from sumo_cohesion.cli.terminal import (
-    PLANNER_HELP,
-    SET_HELP,
-    clean_stdout,
-    parsed_overrides,
-    print_summary,
-    progress_bar,
-    records,
-    shown,
-)
+from sumo_cohesion.cli import options
+from sumo_cohesion.cli.terminal import clean_stdout, print_summary, progress_bar, records, shown
+from sumo_cohesion.errors import UserError
 
 if TYPE_CHECKING:
     import pandas as pd
 
+Output = Literal["fcd", "tripinfo", "ssm"]
+SUMO_OUTPUTS = get_args(Output)
+"""As in traffic.outputs, which the command line does not load before it has to."""
+
 
 @click.command()
 @click.argument("scenario")
-@click.option("--planner", default="cohesive", show_default=True, help=PLANNER_HELP)
+@click.option("--planner", default="cohesive", show_default=True, help=options.PLANNER_HELP)
 @click.option("--seed", type=int, default=0, show_default=True, help="Varies the traffic.")
-@click.option("--set", "changes", multiple=True, metavar="NAME=VALUE", help=SET_HELP)
+@options.changes
 @click.option("--out", type=click.Path(path_type=Path), help="Folder for the run's tables.")
-@click.option("--gui", is_flag=True, help="Show SUMO's window (needs sumo-cohesion[gui]).")
+@click.option("--gui", is_flag=True, help="Show SUMO's window (needs 'sumo-cohesion[gui]').")
+@click.option(
+    "--sumo-outputs",
+    metavar="KINDS",
+    default="",
+    help="SUMO's own outputs to keep, too: fcd, tripinfo, ssm; several by commas. Needs --out.",
+)
 @click.option("--json", "as_json", is_flag=True, help="Print the metrics as JSON.")
+@options.traceback
 def run(
     scenario: str,
     planner: str,
@@ -38,6 +42,7 @@ def run(
     changes: tuple[str, ...],
     out: Path | None,
     gui: bool,
+    sumo_outputs: str,
     as_json: bool,
 ) -> None:
     """Drive SCENARIO (a bundled name or a TOML file) once."""
@@ -45,7 +50,13 @@ def run(
 
     with clean_stdout():
         rollout = run_once(
-            scenario, planner, seed, overrides=parsed_overrides(changes), out=out, gui=gui
+            scenario,
+            planner,
+            seed,
+            overrides=options.parsed_overrides(changes),
+            out=out,
+            sumo_outputs=_sumo_outputs(sumo_outputs, out),
+            gui=gui,
         )
     _warn_of_failures(rollout.plan)
     lights = rollout.info["traffic_lights"]
@@ -67,12 +78,15 @@ def run(
 
 @click.command()
 @click.argument("scenario")
-@click.option("--planners", default="nominal,cohesive", show_default=True, help=PLANNER_HELP)
+@click.option(
+    "--planners", default="nominal,cohesive", show_default=True, help=options.PLANNER_HELP
+)
 @click.option("--seeds", default="0:20", show_default=True, help="0:20 is half-open; or 3,7,9.")
-@click.option("--workers", type=click.IntRange(min=1), help="Processes. Default: one per core.")
-@click.option("--set", "changes", multiple=True, metavar="NAME=VALUE", help=SET_HELP)
+@options.workers
+@options.changes
 @click.option("--out", type=click.Path(path_type=Path), help="Default: results/SCENARIO.")
 @click.option("--json", "as_json", is_flag=True, help="Print runs and summary as JSON.")
+@options.traceback
 def compare(
     scenario: str,
     planners: str,
@@ -89,12 +103,15 @@ def compare(
 
     folder = out if out is not None else Path("results") / Path(scenario).stem
     names, numbers = split_names(planners), parse_seeds(seeds)
-    with clean_stdout(), progress_bar(f"{scenario}") as progress:
+    if seeds.isdecimal():
+        note = f"--seeds {seeds} is the one seed {seeds}; 0:{seeds} is {seeds} seeds"
+        click.echo(f"note: {note}", err=True)
+    with clean_stdout(), progress_bar(scenario, len(names) * len(numbers)) as progress:
         result = compare_planners(
             scenario,
             names,
             numbers,
-            overrides=parsed_overrides(changes),
+            overrides=options.parsed_overrides(changes),
             workers=workers,
             out=folder,
             progress=progress,
@@ -113,6 +130,20 @@ def compare(
     else:
         print_summary(result.summary)
     click.echo(f"runs and tables in {folder}, picture in {picture}", err=True)
+
+
+def _sumo_outputs(kinds: str, out: Path | None) -> list[Output]:
+    from sumo_cohesion.user_input import closest, split_names
+
+    asked = split_names(kinds)
+    known: dict[str, Output] = {kind: kind for kind in SUMO_OUTPUTS}
+    for kind in asked:
+        if kind not in known:
+            hint = closest(kind, SUMO_OUTPUTS) or f"; choose from {', '.join(SUMO_OUTPUTS)}"
+            raise UserError(f"--sumo-outputs: SUMO has no output {kind!r} here{hint}")
+    if asked and out is None:
+        raise UserError("--sumo-outputs are tables; name the folder for them with --out")
+    return [known[kind] for kind in asked]
 
 
 def _warn_of_failures(plan: pd.DataFrame) -> None:

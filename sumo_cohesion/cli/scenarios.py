@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from sumo_cohesion.cli.terminal import SET_HELP, parsed_overrides
+from sumo_cohesion.cli import options
 
 
 @click.command()
@@ -26,10 +26,10 @@ def scenario() -> None:
 @scenario.command("export")
 @click.argument("name", metavar="SCENARIO")
 @click.option("--seed", type=int, default=0, show_default=True)
-@click.option("--set", "changes", multiple=True, metavar="NAME=VALUE", help=SET_HELP)
+@options.changes
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder to write.")
 def export(name: str, seed: int, changes: tuple[str, ...], out: Path) -> None:
     """Write SCENARIO for plain SUMO: sumo-gui -c OUT/scenario.sumocfg."""
     from sumo_cohesion.simulation.export import export_scenario
 
-    click.echo(export_scenario(name, out, seed=seed, overrides=parsed_overrides(changes)))
+    click.echo(export_scenario(name, out, seed=seed, overrides=options.parsed_overrides(changes)))

@@ -1,4 +1,4 @@
-"""What commands share: options in words, numbers and progress on a terminal."""
+"""What commands print: numbers, tables, and how far they are."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 import os
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
@@ -15,21 +15,12 @@ import click
 if TYPE_CHECKING:
     import pandas as pd
 
-PLANNER_HELP = "nominal, cohesive, paper, sumo, or your own as module:Class(gain=2.5)."
 _SIDE_BY_SIDE = 4
 """Planners, or points of a grid, that a summary shows beside each other."""
 _IN_SHORT = ("success", "collision", "off_road", "mean_speed", "plan_failures")
 """What it shows of more than these."""
 _QUIET = 60.0
 """Seconds between two lines of progress where there is no terminal."""
-SET_HELP = "Change a setting, e.g. cohesion.beta=0.05, planner.horizon=10, ego.speed=20."
-
-
-def parsed_overrides(changes: Sequence[str]) -> dict[str, Any]:
-    """Return settings by dotted name, from the values of --set."""
-    from sumo_cohesion.user_input import parse_override
-
-    return dict(parse_override(text) for text in changes)
 
 
 def records(frame: pd.DataFrame) -> list[dict[str, Any]]:
@@ -76,8 +67,30 @@ def print_summary(summary: pd.DataFrame) -> None:
 
 
 @contextmanager
-def progress_bar(title: str) -> Iterator[Any]:
-    """Show a bar with rate and ETA on a terminal, nothing elsewhere; on standard error."""
+def progress_bar(title: str, runs: int | None = None) -> Iterator[Any]:
+    """Say how far a number of runs are, on standard error: (done, total, failed) are shown.
+
+    A bar with rate and ETA on a terminal; elsewhere a line now and then, for the log of a night.
+    """
+    with _bar(title, runs) if sys.stderr.isatty() else _lines(title) as show:
+        yield show
+
+
+@contextmanager
+def _lines(title: str) -> Iterator[Any]:
+    told = time.monotonic()
+
+    def show(done: int, total: int, failed: int = 0) -> None:
+        nonlocal told
+        if time.monotonic() - told > _QUIET:
+            told = time.monotonic()
+            click.echo(f"{_counted(title, failed)}: {done} of {total}", err=True)
+
+    yield show
+
+
+@contextmanager
+def _bar(title: str, runs: int | None) -> Iterator[Any]:
     from rich.console import Console
     from rich.progress import (
         BarColumn,
@@ -96,21 +109,17 @@ def progress_bar(title: str) -> Iterator[Any]:
         TextColumn("ETA"),
         TimeRemainingColumn(),
     )
-    console = Console(stderr=True)
-    with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
-        task = bar.add_task(title, total=None)
-        told = time.monotonic()
+    with Progress(*columns, console=Console(stderr=True)) as bar:
+        task = bar.add_task(title, total=runs)
 
         def show(done: int, total: int, failed: int = 0) -> None:
-            nonlocal told
-            note = f"{title}, {failed} failed" if failed else title
-            bar.update(task, completed=done, total=total, description=note)
-            # Where there is no terminal, a line now and then: for the log of a night's batch.
-            if bar.disable and time.monotonic() - told > _QUIET:
-                told = time.monotonic()
-                click.echo(f"{note}: {done} of {total}", err=True)
+            bar.update(task, completed=done, total=total, description=_counted(title, failed))
 
         yield show
+
+
+def _counted(title: str, failed: int) -> str:
+    return f"{title}, {failed} failed" if failed else title
 
 
 @contextmanager
