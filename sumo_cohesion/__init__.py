@@ -11,16 +11,23 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from sumo_cohesion.batches.batch import batch
     from sumo_cohesion.batches.comparison import Comparison, compare
-    from sumo_cohesion.batches.results import load_metrics, load_trajectories
+    from sumo_cohesion.batches.results import load_metrics, load_rollout, load_trajectories
     from sumo_cohesion.errors import SimulationError, UserError
+    from sumo_cohesion.planning.planners import Planner
     from sumo_cohesion.simulation.export import export_scenario
     from sumo_cohesion.simulation.run import run
     from sumo_cohesion.simulation.scenario import load_scenario
+    from sumo_cohesion.state import Control, Observation, Plan, RoadState
     from sumo_cohesion.tables.paired import compare_planners
     from sumo_cohesion.tables.rollout import Rollout
 
 _HOME = {
     "Comparison": "batches.comparison",
+    "Control": "state",
+    "Observation": "state",
+    "Plan": "state",
+    "Planner": "planning.planners",
+    "RoadState": "state",
     "Rollout": "tables.rollout",
     "SimulationError": "errors",
     "UserError": "errors",
@@ -29,6 +36,7 @@ _HOME = {
     "compare_planners": "tables.paired",
     "export_scenario": "simulation.export",
     "load_metrics": "batches.results",
+    "load_rollout": "batches.results",
     "load_scenario": "simulation.scenario",
     "load_trajectories": "batches.results",
     "run": "simulation.run",
@@ -36,6 +44,11 @@ _HOME = {
 
 __all__ = [
     "Comparison",
+    "Control",
+    "Observation",
+    "Plan",
+    "Planner",
+    "RoadState",
     "Rollout",
     "SimulationError",
     "UserError",
@@ -44,6 +57,7 @@ __all__ = [
     "compare_planners",
     "export_scenario",
     "load_metrics",
+    "load_rollout",
     "load_scenario",
     "load_trajectories",
     "run",
@@ -54,3 +68,7 @@ def __getattr__(name: str) -> object:
     if name not in _HOME:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(importlib.import_module(f"{__name__}.{_HOME[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return __all__

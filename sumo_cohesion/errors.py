@@ -22,6 +22,11 @@ class StoppedError(UserError):
 
     rollout: object = None
 
+    def __reduce__(self) -> tuple[object, ...]:
+        # To another process goes what it says, without the tables.
+        kept = {key: value for key, value in vars(self).items() if key != "rollout"}
+        return type(self), self.args, kept
+
     def said(self, more: str) -> StoppedError:
         """Return the same error, with more to say."""
         error = StoppedError(f"{self}; {more}")

@@ -4,15 +4,20 @@ from __future__ import annotations
 
 import difflib
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence, Sized
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, SupportsIndex, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
 from sumo_cohesion.errors import UserError
 
 Model = TypeVar("Model", bound=BaseModel)
+MOST_SEEDS = 1_000_000
+"""Seeds that a text may stand for: a mistake should be a line, not a night of silence."""
+_LONGEST = 60
+"""Characters of a value that a message repeats."""
 
 
 def read_toml(path: Path) -> dict[str, Any]:
@@ -25,6 +30,37 @@ def read_toml(path: Path) -> dict[str, Any]:
         raise UserError(f"{path}: not valid TOML: {error}") from None
     except ValueError as error:
         raise UserError(f"{str(path)!r}: not a file's name ({error})") from None
+
+
+_SUMO_FILES = {
+    ".sumocfg": "SUMO configuration",
+    ".net.xml": "SUMO network",
+    ".rou.xml": "SUMO route file",
+    ".add.xml": "SUMO additional file",
+    ".xml": "SUMO file",
+}
+
+
+def refuse_sumo_file(name: str) -> None:
+    """Raise UserError if a name is that of one of SUMO's files, and not of one of ours."""
+    for suffix, kind in _SUMO_FILES.items():
+        if name.removesuffix(".gz").endswith(suffix):
+            raise UserError(
+                f"{name}: is a {kind}, not a scenario; write a scenario: a .toml file that names "
+                "the network, the routes, and where the ego drives (docs/scenarios.md)"
+            )
+
+
+def refuse_other_kind(data: Mapping[str, Any], path: Path, kind: str) -> None:
+    """Raise UserError if a file that should be a scenario is an experiment, or the other way."""
+    if kind == "scenario" and "scenarios" in data:
+        raise UserError(
+            f"{path}: is an experiment, not a scenario; do it with sumo-cohesion batch {path}"
+        )
+    if kind == "experiment" and "network" in data:
+        raise UserError(
+            f"{path}: is a scenario, not an experiment; drive it with sumo-cohesion run {path}"
+        )
 
 
 def merge(data: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
@@ -64,10 +100,10 @@ def parse_override(text: str) -> tuple[str, Any]:
     return name.strip(), parsed
 
 
-def split_planners(names: str) -> list[str]:
+def split_names(names: str) -> list[str]:
     """Split names at commas, but not within brackets or quotes.
 
-    >>> split_planners("nominal, my:Follow(gain=(1, 2), name='a, ('),sumo")
+    >>> split_names("nominal, my:Follow(gain=(1, 2), name='a, ('),sumo")
     ['nominal', "my:Follow(gain=(1, 2), name='a, (')", 'sumo']
     """
     parts, depth, quote = [""], 0, ""
@@ -85,25 +121,69 @@ def split_planners(names: str) -> list[str]:
     return [part.strip() for part in parts if part.strip()]
 
 
-def parse_seeds(text: str, what: str = "--seeds") -> list[int]:
-    """Parse "0:20" (half-open) or "3,7,9".
+def seeds_of(given: object) -> list[int]:
+    """Seeds, however they are given: "0:20" (half-open), "3,7,9", a range or a list.
 
-    >>> parse_seeds("0:3"), parse_seeds("3,7,9")
-    ([0, 1, 2], [3, 7, 9])
+    >>> seeds_of("0:3"), seeds_of("3,7,9"), seeds_of(range(2))
+    ([0, 1, 2], [3, 7, 9], [0, 1])
+
+    Raises
+    ------
+    ValueError
+        If they are none; the message says how to write them.
     """
+    if isinstance(given, str):
+        return _seeds_in(given)
+    if isinstance(given, Sized) and len(given) > MOST_SEEDS:
+        raise ValueError("more than a million seeds; make several parts")
+    if isinstance(given, Iterable):
+        return [_whole(value) for value in given]
+    number = _whole(given)
+    raise ValueError(f"is one number; write [{number}] for it alone, 0:{number} for as many seeds")
+
+
+def _seeds_in(text: str) -> list[int]:
     try:
-        if ":" in text:
-            low, high = (int(part) for part in text.split(":"))
-            if high - low > 1_000_000:
-                raise UserError(f"{what} {text!r}: more than a million seeds; make several parts")
-            seeds = list(range(low, high))
-        else:
-            seeds = [int(part) for part in text.split(",")]
+        if ":" not in text:
+            return [int(part) for part in text.split(",")]
+        low, high = (int(part) for part in text.split(":"))
     except ValueError:
-        raise UserError(f"{what} {text!r}: write 0:20 for 0 to 19, or a list 3,7,9") from None
-    if not seeds:
-        raise UserError(f"{what} {text!r} is empty; 0:20 means 0 to 19, the end is not included")
-    return seeds
+        raise ValueError("write 0:20 for 0 to 19, or a list 3,7,9") from None
+    if high <= low:
+        raise ValueError("is empty; 0:20 means 0 to 19, the end is not included")
+    return seeds_of(range(low, high))
+
+
+def _whole(value: object) -> int:
+    if isinstance(value, bool) or not isinstance(value, SupportsIndex):
+        raise ValueError(f"{value!r} is no valid integer")
+    return value.__index__()
+
+
+def parse_seeds(given: object, what: str = "--seeds") -> list[int]:
+    """Seeds as `seeds_of` reads them; raises UserError, which says ``what`` was wrong."""
+    try:
+        return seeds_of(given)
+    except ValueError as error:
+        shown = repr(given)
+        shown = shown if len(shown) < _LONGEST else f"{shown[:_LONGEST]}..."
+        raise UserError(f"{what} {shown}: {error}") from None
+
+
+def refuse_repeats(values: Iterable[object]) -> None:
+    """Raise ValueError if a value is listed twice."""
+    value, count = next(iter(Counter(values).most_common(1)), (None, 0))
+    if count > 1:
+        raise ValueError(f"{value} is listed twice")
+
+
+_IN_TOML = {
+    "tuple_type": "should be a list, in brackets",
+    "list_type": "should be a list, in brackets",
+    "dict_type": "should be a table of names and values",
+    "model_type": "should be a table of names and values",
+}
+"""What pydantic says in Python's words, in those of a TOML file."""
 
 
 def validated(model: type[Model], data: object, where: str) -> Model:
@@ -112,18 +192,22 @@ def validated(model: type[Model], data: object, where: str) -> Model:
         return model.model_validate(data)
     except ValidationError as error:
         # A misspelt key is also a missing one; name the misspelling.
-        first = min(error.errors(), key=lambda e: e["type"] != "extra_forbidden")
+        found = sorted(error.errors(), key=lambda e: e["type"] != "extra_forbidden")
+        first = found[0]
         key = ".".join(str(part) for part in first["loc"])
+        also = {str(e["loc"][0]) for e in found if e["loc"] and e["type"] != "missing"}
+        also -= {str(part) for part in first["loc"][:1]}
+        rest = f"; look at {', '.join(sorted(also))}, too" if also else ""
         if first["type"] == "extra_forbidden":
             known = _fields_at(model, first["loc"][:-1])
             name = str(first["loc"][-1])
             hint = closest(name, known) or f"; known keys are {', '.join(known)}"
-            raise UserError(f"{where}: unknown key {key!r}{hint}") from None
-        said = first["msg"].removeprefix("Value error, ")
+            raise UserError(f"{where}: unknown key {key!r}{hint}{rest}") from None
+        said = _IN_TOML.get(first["type"], first["msg"].removeprefix("Value error, "))
         got = first.get("input")
         shown = f" (got {got!r})" if isinstance(got, str | int | float | bool | list) else ""
         prefix = f"{where}: {key}: " if key else f"{where}: "
-        raise UserError(prefix + said[:1].lower() + said[1:] + shown) from None
+        raise UserError(prefix + said[:1].lower() + said[1:] + shown + rest) from None
 
 
 def _fields_at(model: type[BaseModel], loc: Sequence[int | str]) -> list[str]:

@@ -118,11 +118,13 @@ def batch(
         return store.join()
 
 
-def dry_run(experiment: str | Path | Mapping[str, Any], out: str | Path) -> pd.DataFrame:
-    """Say what a batch would do: per scenario and planner, how many runs, how many are done.
+def dry_run(
+    experiment: str | Path | Mapping[str, Any], out: str | Path, *, estimate: bool = False
+) -> pd.DataFrame:
+    """Say what a batch would do: per scenario and planner, how many runs, how many are left.
 
-    ``seconds`` is CPU time for those that are left: estimated from the runs that are done, or
-    else from a first run, which is done for this and not kept.
+    ``seconds`` is CPU time for those that are left, from the runs that are done, NaN if there are
+    none; with ``estimate`` a first run is done instead, for its time, and not kept.
     """
     asked = load_experiment(experiment)
     work = spell_out(asked)
@@ -137,9 +139,10 @@ def dry_run(experiment: str | Path | Mapping[str, Any], out: str | Path) -> pd.D
     for (scenario, planner), runs in distinct.groupby(["scenario", "planner"], sort=False):
         left = runs[~runs["run"].isin(finished)]
         seconds = times.get((scenario, planner))
-        if seconds is None and len(left):
+        if seconds is None and len(left) and estimate:
             seconds = _timed(_job(left["run"].iloc[0], int(left["seed"].iloc[0]), asked, work, ""))
-        lines.append((scenario, planner, len(runs), len(left), len(left) * (seconds or 0.0)))
+        total = len(left) * (float("nan") if seconds is None else seconds) if len(left) else 0.0
+        lines.append((scenario, planner, len(runs), len(left), total))
     return pd.DataFrame(lines, columns=["scenario", "planner", "runs", "left", "seconds"])
 
 

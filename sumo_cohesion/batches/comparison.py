@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from dataclasses import dataclass
+from html import escape
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,18 +24,32 @@ from sumo_cohesion.tables.folders import keep, require_replaceable, whole_folder
 from sumo_cohesion.tables.intervals import summarize
 from sumo_cohesion.tables.metrics import deviation
 from sumo_cohesion.tables.rollout import RUN_FILE
+from sumo_cohesion.user_input import parse_seeds, refuse_repeats, split_names
 
 Progress = Callable[[int, int], None]
 """Called with (runs done, runs in all)."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Comparison:
     """One metrics row per run, and rates and means with 95 % intervals per planner."""
 
     runs: pd.DataFrame
     summary: pd.DataFrame
     folder: Path | None
+
+    def __repr__(self) -> str:
+        scenario, where = (
+            self.runs["scenario"].iloc[0],
+            f", in {self.folder}" if self.folder else "",
+        )
+        successes = self.runs.groupby("planner", sort=False)["success"].agg(["sum", "count"])
+        rates = [f"{planner} {done} of {of}" for planner, done, of in successes.itertuples()]
+        more = f" and {len(rates) - 4} more" if len(rates) > 4 else ""
+        return f"<Comparison {scenario}, successes: {', '.join(rates[:4])}{more}{where}>"
+
+    def _repr_html_(self) -> str:
+        return f"<p>{escape(repr(self))}</p>{self.summary.to_html(index=False)}"
 
 
 class _Result(NamedTuple):
@@ -52,8 +67,8 @@ class _Job:
 
 def compare(
     scenario: str | Path,
-    planners: Sequence[AnyPlanner] = ("nominal", "cohesive"),
-    seeds: Sequence[int] = tuple(range(20)),
+    planners: AnyPlanner | Sequence[AnyPlanner] = ("nominal", "cohesive"),
+    seeds: str | Sequence[int] = "0:20",
     *,
     overrides: Mapping[str, Any] | None = None,
     workers: int | None = None,
@@ -65,9 +80,10 @@ def compare(
     Parameters
     ----------
     scenario, overrides : as for run().
-    planners : as for run(). Classes and objects cannot leave this process: their runs are done in
-        it, one after the other, the others' in processes of their own.
-    seeds : each gives all planners the same traffic.
+    planners : as for run(); one text may hold several, separated by commas. Classes and objects
+        cannot leave this process: their runs are done in it, one after the other, the others' in
+        processes of their own.
+    seeds : a list, a range, or "0:20" (half-open); each gives all planners the same traffic.
     workers : processes; one simulation runs in each. Default: one per processor.
     out : folder for all runs, their metrics, the summary and a picture. It must not exist, be
         empty, or hold an earlier comparison, which is replaced when all runs are done.
@@ -81,12 +97,17 @@ def compare(
         If a run or its process failed, or Ctrl-C was pressed. Finished runs are then kept in
         a folder that the message names.
     """
+    planners = split_names(planners) if isinstance(planners, str) else planners
+    if not isinstance(planners, Sequence):
+        planners = (planners,)
+    seeds = parse_seeds(seeds, "seeds")
     if not planners or not seeds:
         raise UserError("nothing to compare: give at least one planner and one seed")
-    for name, values in (("planner", [planner_name(p) for p in planners]), ("seed", seeds)):
-        repeated = [v for v in values if list(values).count(v) > 1]
-        if repeated:
-            raise UserError(f"{name} {repeated[0]} is listed twice")
+    for what, values in (("planner", [planner_name(p) for p in planners]), ("seed", seeds)):
+        try:
+            refuse_repeats(values)
+        except ValueError as error:
+            raise UserError(f"{what} {error}") from None
     requests = [RunRequest(str(scenario), p, s, overrides or {}) for p in planners for s in seeds]
     for request in requests:
         if request.seed in (min(seeds), max(seeds)):
@@ -109,7 +130,7 @@ def compare(
             kept = keep(new, folder)
             kind = UserError if isinstance(error, UserError) else SimulationError
             reason = str(error) or "interrupted"
-            raise kind(f"{reason}; finished runs are kept in {kept}") from None
+            raise kind(f"{reason}; finished runs are kept in {kept}") from error
         comparison = _compared(jobs, results, folder)
         comparison.runs.to_parquet(new / "metrics.parquet", index=False)
         comparison.summary.to_parquet(new / "summary.parquet", index=False)

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
-from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from math import prod
 from pathlib import Path
@@ -29,7 +28,15 @@ from sumo_cohesion.planning.registry import check_planner
 from sumo_cohesion.simulation.request import RunRequest
 from sumo_cohesion.simulation.setup import resolve
 from sumo_cohesion.traffic.outputs import Output
-from sumo_cohesion.user_input import parse_seeds, read_toml, validated
+from sumo_cohesion.user_input import (
+    read_toml,
+    refuse_other_kind,
+    refuse_repeats,
+    refuse_sumo_file,
+    seeds_of,
+    split_names,
+    validated,
+)
 
 Kept = Literal["ego", "trajectory", "plan", "horizon", "agreement", "timing", "reference"]
 """Tables that can be kept per run; ``ego`` is the ego's part of the trajectory."""
@@ -79,30 +86,34 @@ class Experiment(BaseModel):
     grid: dict[str, Annotated[list[Value], Field(min_length=1)]] = {}
     limits: RunLimits = RunLimits()
     _folder: Path = PrivateAttr(default=Path())
+    _source: str = PrivateAttr(default="")
 
     @field_validator("set", "grid", mode="before")
     @classmethod
     def _by_dotted_name(cls, value: Any) -> Any:
         return flatten(value) if isinstance(value, Mapping) else value
 
+    @field_validator("scenarios", "planners", "keep", "sumo_outputs", mode="before")
+    @classmethod
+    def _one_is_a_list(cls, value: Any) -> Any:
+        return split_names(value) if isinstance(value, str) else value
+
     @field_validator("seeds", mode="before")
     @classmethod
     def _as_list(cls, value: Any) -> Any:
-        if isinstance(value, str):
-            return parse_seeds(value, "seeds")
-        return value
+        return seeds_of(value)
 
     @field_validator("scenarios", "planners", "seeds", "keep", "sumo_outputs")
     @classmethod
     def _no_repeats(cls, value: tuple[Any, ...]) -> tuple[Any, ...]:
-        _refuse_repeats(value)
+        refuse_repeats(value)
         return value
 
     @field_validator("grid")
     @classmethod
     def _no_repeated_values(cls, value: dict[str, list[Value]]) -> dict[str, list[Value]]:
         for values in value.values():
-            _refuse_repeats([json.dumps(v, default=str) for v in values])
+            refuse_repeats([json.dumps(v, default=str) for v in values])
         return value
 
     @model_validator(mode="after")
@@ -131,12 +142,6 @@ class Experiment(BaseModel):
 
     def _scenario_path(self, scenario: str) -> str:
         return str(self._folder / scenario) if scenario.endswith(".toml") else scenario
-
-
-def _refuse_repeats(values: Sequence[Any]) -> None:
-    value, count = Counter(values).most_common(1)[0] if values else (None, 0)
-    if count > 1:
-        raise ValueError(f"{value} is listed twice")
 
 
 @dataclass(frozen=True)
@@ -179,8 +184,12 @@ def load_experiment(source: str | Path | Mapping[str, Any]) -> Experiment:
     if isinstance(source, Mapping):
         return validated(Experiment, dict(source), "experiment")
     path = Path(source)
-    experiment = validated(Experiment, read_toml(path), str(path))
+    refuse_sumo_file(str(path))
+    data = read_toml(path)
+    refuse_other_kind(data, path, "experiment")
+    experiment = validated(Experiment, data, str(path))
     experiment._folder = path.parent.resolve()
+    experiment._source = str(path)
     return experiment
 
 
@@ -192,6 +201,15 @@ def spell_out(experiment: Experiment) -> Work:
     UserError
         If a scenario, planner or setting is wrong; all points are looked at.
     """
+    try:
+        return _spelt_out(experiment)
+    except UserError as error:
+        if not experiment._source:
+            raise
+        raise UserError(f"{experiment._source}: {error}") from error
+
+
+def _spelt_out(experiment: Experiment) -> Work:
     blocks: list[dict[str, Any]] = []
     points: dict[str, Point] = {}
     sources: dict[str, str] = {}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ from sumo_cohesion.batches.store import (
 )
 from sumo_cohesion.errors import UserError
 from sumo_cohesion.tables.metrics import deviation
-from sumo_cohesion.tables.rollout import RUN_FILE
+from sumo_cohesion.tables.rollout import RUN_FILE, Rollout
 
 _OF_NOMINAL = ("nominal_lateral_deviation", "nominal_speed_deviation")
 
@@ -42,6 +42,25 @@ def load_metrics(folder: str | Path) -> pd.DataFrame:
         return read_parquet(root / "metrics.parquet")
     parts = [run / "metrics.parquet" for run in _run_folders(root)]
     return pd.concat([read_parquet(part) for part in parts], ignore_index=True)
+
+
+def load_rollout(folder: str | Path) -> Rollout:
+    """Return one run as `run` returned it, from the folder that it wrote.
+
+    Raises
+    ------
+    UserError
+        If it is not the folder of one run, or a table cannot be read.
+    """
+    root = Path(folder)
+    if not (root / RUN_FILE).is_file():
+        below = _run_folders(root)
+        raise UserError(f"{root}: holds {_counted(below)} below; name one, e.g. {below[0]}")
+    return Rollout.read(root)
+
+
+def _counted(folders: Sequence[Path]) -> str:
+    return f"{len(folders)} runs" if len(folders) > 1 else "one run"
 
 
 def load_trajectories(
@@ -116,6 +135,8 @@ def with_nominal_deviation(metrics: pd.DataFrame, folder: str | Path) -> pd.Data
 
 
 def _run_folders(root: Path) -> list[Path]:
+    if not root.is_dir():
+        raise UserError(f"{root}: no such folder, so no runs there; give one written by --out")
     found = sorted(path.parent for path in root.rglob(RUN_FILE))
     if not found:
         raise UserError(

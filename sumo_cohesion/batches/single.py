@@ -6,11 +6,13 @@ Importing it is cheap: the process that asks for a run loads nothing of what dri
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 if TYPE_CHECKING:
     from sumo_cohesion.tables.rollout import Rollout
+    from sumo_cohesion.traffic.outputs import Output
 
 TASK = f"{__name__}:drive"
 """What a worker is asked to do."""
@@ -29,12 +31,15 @@ def drive(
     seed: int,
     overrides: dict[str, Any],
     out: Path | None,
+    sumo_outputs: Sequence[Output] = (),
     gui: bool = False,
 ) -> Driven:
     """Drive one scenario once, as simulation.run.run does."""
     from sumo_cohesion.simulation.run import run
 
-    rollout = run(scenario, planner, seed, overrides=overrides, out=out, gui=gui)
+    rollout = run(
+        scenario, planner, seed, overrides=overrides, out=out, sumo_outputs=sumo_outputs, gui=gui
+    )
     (row,) = rollout.metrics.to_dict(orient="records")
     metrics = {str(name): _plain(value) for name, value in row.items()}
     return Driven(metrics, tuple(_notes(rollout, planner)))

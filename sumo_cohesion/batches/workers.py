@@ -34,7 +34,7 @@ from types import FrameType
 from typing import IO, Any, Literal, NamedTuple, NoReturn
 
 import sumo_cohesion
-from sumo_cohesion.errors import InputsChangedError, SimulationError, StorageError, UserError
+from sumo_cohesion.errors import SimulationError, StorageError, UserError
 
 Kind = Literal["crash", "timeout", "memory", "error"]
 CALLS_PER_PROCESS = 500
@@ -70,7 +70,7 @@ class CallFailedError(Exception):
 
 
 class _Answer(NamedTuple):
-    """What comes back from a process; ``error`` names the kind of exception, if one was raised."""
+    """What comes back from a process: a value, or with ``error`` an exception or what it said."""
 
     value: Any
     error: str
@@ -161,9 +161,8 @@ def _value(answer: _Answer, limits: Limits) -> Any:
     if answer.error == "memory":
         most = f"{limits.memory:g} GB of memory" if limits.memory < float("inf") else "there is"
         raise CallFailedError("memory", f"needed more than {most}")
-    for kind in (InputsChangedError, StorageError, UserError, SimulationError):
-        if answer.error == kind.__name__:
-            raise kind(answer.value)
+    if isinstance(answer.value, UserError | SimulationError):
+        raise answer.value
     raise CallFailedError("error", answer.value)
 
 
@@ -408,10 +407,12 @@ def _answer(function: Callable[..., Any], call: bytes) -> _Answer:
     except MemoryError:
         value, error = "", "memory"
     except (UserError, SimulationError) as raised:
-        value, error = str(raised), type(raised).__name__
+        if raised.__cause__ is not None:  # which stays here: somebody's code that went wrong
+            raised.add_note("".join(traceback.format_exception(raised.__cause__)))
+        value, error = raised, "error"
     except OSError as raised:
-        full = raised.errno in _NO_SPACE
-        value, error = _described(raised), StorageError.__name__ if full else "error"
+        said = _described(raised)
+        value, error = StorageError(said) if raised.errno in _NO_SPACE else said, "error"
     except Exception as raised:
         value, error = _described(raised), "error"
     return _Answer(value, error, _peak_memory())

@@ -1,18 +1,22 @@
 """Planners by name, and which roads they can drive along.
 
-A built-in name, ``package.module:Class`` for a planner of your own, or
-``package.module:Class(gain=2.5)`` with arguments.
+A built-in name, ``package.module:Class`` or ``folder/file.py:Class`` for a planner of your own,
+``module:Class(gain=2.5)`` with arguments. A name imports a module, which runs that module's code,
+and calls a class; nothing but a planner's class is called.
 """
 
 from __future__ import annotations
 
 import ast
+import difflib
 import importlib
+import inspect
 import re
 import sys
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias
+from types import ModuleType
+from typing import Any, NamedTuple, TypeAlias, TypeGuard
 
 from sumo_cohesion.errors import UserError
 from sumo_cohesion.planning.cohesive import CohesivePlanner
@@ -64,7 +68,13 @@ def make_planner(
     """
     if not isinstance(planner, str):
         name = planner_name(planner)
-        return _checked(_made(planner, {}, name) if isinstance(planner, type) else planner, name)
+        if not (
+            _is_planner(planner) if isinstance(planner, type) else isinstance(planner, Planner)
+        ):
+            raise UserError(
+                f"planner {name!r} needs the methods reset(road) and plan(observation, history)"
+            )
+        return _made(planner, {}, name) if isinstance(planner, type) else planner
     if planner == "sumo":
         return SumoDriver()
     if planner in BUILT_IN:
@@ -80,11 +90,15 @@ def check_planner(name: str) -> None:
 
 
 class OwnPlanner(NamedTuple):
-    """A user's own planner: its module, its class, and the keyword arguments to make it with."""
+    """A user's own planner: its module, its class, and the keyword arguments to make it with.
+
+    ``file`` is that of the module, if the name says so.
+    """
 
     module: str
     name: str
     arguments: dict[str, Any]
+    file: Path | None = None
 
 
 def parse_planner(name: str) -> OwnPlanner:
@@ -98,12 +112,9 @@ def parse_planner(name: str) -> OwnPlanner:
     UserError
         If it is not of this form; arguments are Python literals by name.
     """
-    found = re.fullmatch(r"([\w.]+):(\w+)(\(.*\))?", name)
+    found = re.fullmatch(r"([^:()]+\.py|[\w.]+):(\w+)(\(.*\))?", name)
     if found is None:
-        raise UserError(
-            f"unknown planner {name!r}; choose {', '.join(BUILT_IN)} or your own as module:Class, "
-            "or module:Class(gain=2.5)"
-        )
+        raise UserError(f"unknown planner {name!r}{_meant(name)}")
     module, class_name, arguments = found.groups()
     try:
         call = ast.parse(f"f{arguments or '()'}", mode="eval").body
@@ -117,39 +128,93 @@ def parse_planner(name: str) -> OwnPlanner:
             f"planner {name!r}: write its arguments by name and as Python literals, e.g. "
             f"{module}:{class_name}(gain=2.5, file='weights.txt')"
         ) from None
-    return OwnPlanner(module, class_name, given)
+    file = Path(module).resolve() if module.endswith(".py") else None
+    return OwnPlanner(file.stem if file else module, class_name, given, file)
+
+
+def _meant(name: str) -> str:
+    """Suggest planners for a name that is none."""
+    words = re.split(r"[\s;,]+", name)
+    if len(words) > 1 and all(word in BUILT_IN or ":" in word for word in words):
+        return "; that is several: separate them by commas, where several can be given"
+    if close := difflib.get_close_matches(name, BUILT_IN, 1):
+        return f"; did you mean {close[0]!r}?"
+    file = Path(name if name.endswith(".py") else f"{name}.py")
+    if classes := _planners_in(file):
+        return f"; did you mean {name}:{classes[0]}?"
+    return (
+        f"; choose {', '.join(BUILT_IN)} or your own as module:Class, file.py:Class, or "
+        "module:Class(gain=2.5)"
+    )
+
+
+def _planners_in(file: Path) -> list[str]:
+    """Names of the classes in a file that have a planner's methods; nothing of it is run."""
+    try:
+        tree = ast.parse(file.read_bytes())
+    except (OSError, SyntaxError, ValueError):
+        return []
+    return [
+        node.name
+        for node in tree.body
+        if isinstance(node, ast.ClassDef)
+        and {"reset", "plan"} <= {d.name for d in node.body if isinstance(d, ast.FunctionDef)}
+    ]
 
 
 def _load_planner(name: str) -> Planner:
-    module_name, class_name, arguments = parse_planner(name)
+    module_name, class_name, arguments, file = parse_planner(name)
+    if file is not None and not file.is_file():
+        raise UserError(f"planner {name!r}: there is no file {file}")
     # A user's module usually lies in the folder they work in. It comes last: what else lies there
     # may have any name, that of a module of the standard library, too.
-    here = str(Path.cwd())
+    here = str(file.parent if file is not None else Path.cwd())
     if here not in sys.path:
         sys.path.append(here)
     try:
         module = importlib.import_module(module_name)
     except (Exception, SystemExit) as error:
         said = str(error) if isinstance(error, ImportError) else f"{type(error).__name__}: {error}"
-        raise UserError(f"planner {name!r}: cannot import {module_name!r} ({said})") from None
-    if not hasattr(module, class_name):
-        raise UserError(f"planner {name!r}: {module_name!r} has no {class_name!r}")
-    return _checked(_made(getattr(module, class_name), arguments, name), name)
+        raise UserError(f"planner {name!r}: cannot import {module_name!r} ({said})") from error
+    found = getattr(module, "__file__", None)
+    if file is not None and (found is None or Path(found).resolve() != file):
+        raise UserError(
+            f"planner {name!r}: another module is called {module_name!r}; rename {file.name}"
+        )
+    kind = getattr(module, class_name, None)
+    # Looked at before it is called: a name comes from a file, and may name anything.
+    if not _is_planner(kind):
+        raise UserError(f"planner {name!r}: {_not_a_planner(module, class_name)}")
+    return _made(kind, arguments, name)
 
 
-def _made(kind: Any, arguments: dict[str, Any], name: str) -> object:
+def _made(kind: type[Planner], arguments: dict[str, Any], name: str) -> Planner:
     try:
         return kind(**arguments)
     except (Exception, SystemExit) as error:
         said = f"{type(error).__name__}: {error}"
         raise UserError(
             f"planner {name!r}: the class cannot be called with these arguments ({said})"
-        ) from None
+        ) from error
 
 
-def _checked(planner: object, name: str) -> Planner:
-    if not isinstance(planner, Planner):
-        raise UserError(
-            f"planner {name!r} needs the methods reset(road) and plan(observation, history)"
+def _is_planner(kind: object) -> TypeGuard[type[Planner]]:
+    return inspect.isclass(kind) and all(
+        callable(getattr(kind, method, None)) for method in ("reset", "plan")
+    )
+
+
+def _not_a_planner(module: ModuleType, name: str) -> str:
+    if hasattr(module, name):
+        return (
+            f"{name!r} is no class that can drive; it needs the methods reset(road) and "
+            "plan(observation, history)"
         )
-    return planner
+    own = [n for n, kind in vars(module).items() if _is_planner(kind) and _lives_in(kind, module)]
+    close = difflib.get_close_matches(name, own, 1) or own[:1]
+    hint = f"; did you mean {close[0]!r}?" if close else ""
+    return f"{module.__name__!r} has no {name!r}{hint}"
+
+
+def _lives_in(kind: type, module: ModuleType) -> bool:
+    return kind.__module__ == module.__name__

@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-import traceback
-from dataclasses import replace
-from pathlib import Path
 from time import perf_counter
 from typing import NamedTuple
 
 from sumo_cohesion.perception.history import History
 from sumo_cohesion.planning import dynamics
 from sumo_cohesion.planning.fallback import fallback
-from sumo_cohesion.planning.planners import Planner
+from sumo_cohesion.planning.planners import Planner, accepted, described, start
 from sumo_cohesion.planning.settings import PlannerSettings
 from sumo_cohesion.road import Road
 from sumo_cohesion.state import STEP, CartesianState, Control, Observation, Plan
 
-SHARPEST, HARDEST = 1.0, 100.0
-"""Curvature (1/m) and acceleration (m/s²) beyond which a control is not that of a car."""
 END_OF_ROUTE = 20.0
 """Metres before the end of its route up to which a car is planned; SUMO would remove it there."""
 
@@ -44,7 +39,7 @@ class PlannedCar:
     def __init__(
         self, planner: Planner, road: Road, history: History, settings: PlannerSettings
     ) -> None:
-        planner.reset(road)
+        start(planner, road)
         self.road = road
         self.spent = Spent()
         self._planner = planner
@@ -74,32 +69,11 @@ def ask(
 ) -> Plan:
     """Ask the planner; whatever goes wrong in it, the car gets a plan and it is counted."""
     try:
-        plan = planner.plan(observation, history)
-        if not all(isinstance(control, Control) for control in plan.controls):
-            controls = tuple(Control(float(c), float(a)) for c, a in plan.controls)
-            plan = replace(plan, controls=controls)
-        usable = all(_is_physical(control) for control in plan.controls[:1])
-        status = "control is not finite, or not that of a car"
+        return accepted(planner.plan(observation, history))
     except MemoryError:
         raise  # a car cannot drive on without memory; the run ends
     except Exception as error:
-        usable, status = False, f"{type(error).__name__}: {error}{_where(error)}"
-    return plan if usable else fallback(observation, road, settings, status)
-
-
-def _where(error: Exception) -> str:
-    """File and line of the planner's module at which `plan` raised; empty if it returned."""
-    frames = traceback.extract_tb(error.__traceback__)[1:]  # the first is ask()
-    if not frames or frames[0].name != "plan":
-        return ""
-    own = [frame for frame in frames if frame.filename == frames[0].filename]
-    return f" ({Path(own[-1].filename).name}:{own[-1].lineno})"
-
-
-def _is_physical(control: Control) -> bool:
-    """Tell whether any car could follow a control; no comparison with NaN is true."""
-    curvature, acceleration = control
-    return abs(curvature) <= SHARPEST and abs(acceleration) <= HARDEST
+        return fallback(observation, road, settings, described(error))
 
 
 def drive(state: CartesianState, plan: Plan, settings: PlannerSettings) -> CartesianState | None:

@@ -12,7 +12,14 @@ from sumo_cohesion.errors import UserError
 from sumo_cohesion.tables.metrics import METRICS, OF_REFERENCE
 from sumo_cohesion.traffic.demand import EgoDemand, Randomization
 from sumo_cohesion.traffic.drivers import Event
-from sumo_cohesion.user_input import closest, merge, read_toml, validated
+from sumo_cohesion.user_input import (
+    closest,
+    merge,
+    read_toml,
+    refuse_other_kind,
+    refuse_sumo_file,
+    validated,
+)
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
@@ -148,6 +155,7 @@ def load_scenario(source: str | Path, overrides: Mapping[str, Any] | None = None
     """
     path = Path(source)
     if path.suffix != ".toml":
+        refuse_sumo_file(str(source))
         names = [p.stem for p in scenario_files()]
         if str(source) not in names:
             raise UserError(
@@ -156,6 +164,7 @@ def load_scenario(source: str | Path, overrides: Mapping[str, Any] | None = None
             )
         path = bundled("scenarios") / f"{source}.toml"
     data = read_toml(path)
+    refuse_other_kind(data, path, "scenario")
     scenario = validated(Scenario, merge(data, overrides or {}), str(path))
     scenario._folder = path.parent.resolve()
     return scenario

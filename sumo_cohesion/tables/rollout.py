@@ -5,19 +5,21 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from html import escape
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 
 from sumo_cohesion.errors import UserError
+from sumo_cohesion.state import STEP
 from sumo_cohesion.tables.columns import TABLES
 from sumo_cohesion.tables.folders import require_replaceable, whole_folder
 
 RUN_FILE = "run.json"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Rollout:
     """The complete record of one run.
 
@@ -39,8 +41,19 @@ class Rollout:
     metrics: pd.DataFrame
     sumo: Mapping[str, pd.DataFrame] = field(default_factory=dict)
 
-    def write(self, folder: Path) -> Path:
+    def __repr__(self) -> str:
+        row = self.metrics.iloc[0]
+        planner = row["planner"] if len(row["planner"]) < 60 else f"{row['planner'][:60]}..."
+        ended = f"{row['outcome']}, {'success' if row['success'] else 'no success'}"
+        seconds = f"{len(self.plan) * STEP:.1f} s"
+        return f"<Rollout {row['scenario']}, {planner}, seed {row['seed']}: {ended}, {seconds}>"
+
+    def _repr_html_(self) -> str:
+        return f"<p>{escape(repr(self))}</p>{self.metrics.T.to_html(header=False)}"
+
+    def write(self, folder: str | Path) -> Path:
         """Write run.json and one parquet file per table, all of them or none."""
+        folder = Path(folder)
         require_replaceable(folder)
         with whole_folder(folder) as new:
             for name in TABLES:
@@ -52,8 +65,9 @@ class Rollout:
         return folder
 
     @staticmethod
-    def read(folder: Path) -> Rollout:
+    def read(folder: str | Path) -> Rollout:
         """Read a folder that `write` wrote."""
+        folder = Path(folder)
         try:
             info = json.loads((folder / RUN_FILE).read_text(encoding="utf-8"))
             tables = {name: pd.read_parquet(folder / f"{name}.parquet") for name in TABLES}

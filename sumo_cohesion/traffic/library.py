@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import shutil
 import sys
 import tempfile
@@ -36,8 +37,10 @@ def load_libsumo() -> Any:
         raise UserError(f"libsumo cannot be loaded ({error}); pip install libsumo") from None
     version = sumo_version(libsumo)
     if version < OLDEST_SUMO:
+        found, least = (".".join(map(str, numbers)) for numbers in (version, OLDEST_SUMO))
         raise UserError(
-            f"libsumo {libsumo.__version__} is too old; pip install --upgrade 'libsumo>=1.24'"
+            f"libsumo {found} is too old; "
+            f"pip install --upgrade 'libsumo>={least}' 'sumolib>={least}' 'traci>={least}'"
         )
     return libsumo
 
@@ -73,9 +76,12 @@ def vehicle_type_attributes() -> frozenset[str]:
 
 
 def sumo_version(libsumo: Any) -> tuple[int, int]:
-    """Return SUMO's version as (major, minor)."""
-    major, minor = str(libsumo.__version__).split(".")[:2]
-    return int(major), int(minor)
+    """Return SUMO's version as (major, minor), as SUMO itself says it.
+
+    libsumo's ``__version__`` came with 1.26; versions built from source say 1_28 for 1.28.
+    """
+    found = re.search(r"(\d+)[._](\d+)", libsumo.getVersion()[1])
+    return (int(found[1]), int(found[2])) if found else OLDEST_SUMO
 
 
 def load_window() -> tuple[Any, str]:

@@ -6,7 +6,7 @@ Only what every network has that SUMO's own programs write is asked for. One wal
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
-from collections.abc import Collection, Iterator
+from collections.abc import Collection
 from dataclasses import dataclass
 from math import inf, isfinite
 from pathlib import Path

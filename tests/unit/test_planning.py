@@ -294,7 +294,11 @@ def test_planners_by_name() -> None:
         ("no_such_module:Planner(**{'a': 1})", "arguments by name"),
         ("json:Planner", "'json' has no 'Planner'"),
         ("json:JSONDecoder", "needs the methods"),
-        ("datetime:datetime", "cannot be called with these arguments"),
+        ("datetime:datetime", "needs the methods"),
+        (
+            "sumo_cohesion.planning.planners:SumoDriver(a=1)",
+            "cannot be called with these arguments",
+        ),
     ],
 )
 def test_planner_names_that_are_wrong(name: str, message: str) -> None:

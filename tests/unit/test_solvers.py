@@ -359,7 +359,7 @@ def plans(**environment: str) -> tuple[str, str]:
 
 
 def test_compiled_or_not_the_plans_are_the_same_bit_for_bit(tmp_path: Path) -> None:
-    if compilation._find_compiler() is None:
+    if compilation.find_compiler() is None:
         pytest.skip("no C compiler here")
     how, fast = plans(XDG_CACHE_HOME=str(tmp_path))
     assert how == "compiled"
@@ -382,7 +382,7 @@ def test_compiled_or_not_the_plans_are_the_same_bit_for_bit(tmp_path: Path) -> N
 def test_without_a_working_compiler_it_plans_all_the_same(
     environment: dict[str, str], said: str, tmp_path: Path
 ) -> None:
-    if "XDG_CACHE_HOME" in environment and compilation._find_compiler() is None:
+    if "XDG_CACHE_HOME" in environment and compilation.find_compiler() is None:
         pytest.skip("no C compiler here")
     how, rest = plans(**{"XDG_CACHE_HOME": str(tmp_path), **environment})
     assert how.startswith("not compiled: ")
@@ -391,7 +391,7 @@ def test_without_a_working_compiler_it_plans_all_the_same(
 
 
 def test_many_processes_compile_once(tmp_path: Path) -> None:
-    if compilation._find_compiler() is None:
+    if compilation.find_compiler() is None:
         pytest.skip("no C compiler here")
     environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path)}
     code = CODE.replace("range(20)", "range(1)")

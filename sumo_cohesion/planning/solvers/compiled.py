@@ -49,7 +49,7 @@ def compiled(functions: Sequence[Any]) -> tuple[list[Any], str]:
     """Return the same functions compiled, and "compiled"; or as they are, and why."""
     if os.environ.get(SWITCH) == "0":
         return list(functions), f"not compiled: {SWITCH} is 0"
-    compiler = _find_compiler()
+    compiler = find_compiler()
     if compiler is None:
         return list(functions), "not compiled: no C compiler (cc, gcc or clang) found"
     try:
@@ -65,7 +65,8 @@ def compiled(functions: Sequence[Any]) -> tuple[list[Any], str]:
         return list(functions), f"not compiled: {said}"
 
 
-def _find_compiler() -> str | None:
+def find_compiler() -> str | None:
+    """Path of the C compiler that is used; None if there is none."""
     wanted = (os.environ.get("CC"), "cc", "gcc", "clang")
     return next((path for name in wanted if name and (path := shutil.which(name))), None)
 
