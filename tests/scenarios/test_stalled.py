@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import json
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,8 @@ import pytest
 import sumo_cohesion
 from sumo_cohesion import Rollout, compare, load_metrics, run
 from sumo_cohesion.tables.columns import TABLES
+from tests.conftest import ROOT
+from tests.waiting import Gate, is_running, started, wait_for
 
 TIMED = ["plan_ms_median", "plan_ms_p99"]
 REPEATABLE = ("trajectory", "plan", "agreement")
@@ -252,39 +255,18 @@ def test_a_dead_worker_is_one_line_and_finished_runs_are_kept(tmp_path: Path) ->
     assert (kept["planner"] == "sumo").all()
 
 
-@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="needs Linux")
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="needs Linux")
 def test_workers_end_when_their_parent_is_killed(tmp_path: Path) -> None:
-    import signal
-    import subprocess
-    import sys
-    import time
-
-    code = "from sumo_cohesion import compare; compare('stalled', ('sumo',), range(500), workers=2)"
-    script = tmp_path / "batch.py"
-    script.write_text(f"if __name__ == '__main__':\n    {code}\n")
-    parent = subprocess.Popen([sys.executable, script])
-    threads = Path(f"/proc/{parent.pid}/task")
-    workers: list[str] = []
-    for _ in range(300):
-        time.sleep(0.1)
-        workers = [pid for c in threads.glob("*/children") for pid in c.read_text().split()]
-        if len(workers) >= 2:
-            break
-    assert len(workers) >= 2
-    time.sleep(3.0)
-    parent.send_signal(signal.SIGKILL)
-    parent.wait()
-    for _ in range(100):
-        alive = [pid for pid in workers if _is_running(pid)]
-        if not alive:
-            break
-        time.sleep(0.1)
-    assert alive == []
-
-
-def _is_running(pid: str) -> bool:
-    try:
-        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
-    except OSError:
-        return False
-    return state != "Z"
+    gate = Gate(tmp_path / "gate")
+    planner = f"tests.scenarios.faulty_planners:Held(gate='{gate.folder}')"
+    code = (
+        f'from sumo_cohesion import compare; compare("stalled", ["{planner}"], [0, 1], workers=2)'
+    )
+    with started([sys.executable, "-c", code], cwd=ROOT) as parent:
+        workers = wait_for(
+            lambda: pids if len(pids := gate.waiting()) == 2 else None, parent, "both runs"
+        )
+        assert all(map(is_running, workers))
+        parent.kill()
+        parent.wait()
+        wait_for(lambda: not any(map(is_running, workers)), what="the workers' end")
