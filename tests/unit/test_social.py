@@ -12,11 +12,11 @@ from sumo_cohesion.perception.habit import Habit
 from sumo_cohesion.perception.history import History
 from sumo_cohesion.road import Road
 from sumo_cohesion.social.agreement import Agreement, agree, combine, estimate
-from sumo_cohesion.social.election import Election
+from sumo_cohesion.social.election import Election, surprise_of
 from sumo_cohesion.social.features import FEATURES, SCALES, social_features
 from sumo_cohesion.social.groups import Vote, group_votes
 from sumo_cohesion.social.memory import new_history
-from sumo_cohesion.social.place import NOWHERE, agree_on_place
+from sumo_cohesion.social.place import NOWHERE, Place, agree_on_place
 from sumo_cohesion.social.settings import CohesionSettings
 from sumo_cohesion.state import Observation, RoadState
 
@@ -266,6 +266,57 @@ def test_a_surprise_keeps_attention_for_a_while() -> None:
     assert steers(TURN, 3.0)
     election.reset()
     assert not steers(slight, 3.1)
+
+
+def test_what_is_no_news_is_none_while_a_surprise_is_remembered_either() -> None:
+    """Above 1 is news then, and up to 1 is not."""
+    election = Election(SETTINGS)
+    election.elect((TURN,), NOWHERE, 0.0)
+    for surprise, news in ((1.01, True), (1.0, False), (0.5, False)):
+        group = TURN._replace(weight=(surprise, 400.0, 0.0, 400.0, 0.0))
+        assert surprise_of(group, NOWHERE) == surprise
+        (elected,), _ = election.elect((group,), NOWHERE, 1.0)
+        assert (elected.weight == group.weight) is news, surprise
+
+
+def test_the_threshold_is_the_setting_where_that_is_lower() -> None:
+    election = Election(SETTINGS.model_copy(update={"surprise": 0.5}))
+    for time in (0.0, 1.0):  # at first, and while it is attentive
+        for surprise, news in ((0.51, True), (0.5, False)):
+            group = TURN._replace(weight=(surprise, 400.0, 0.0, 400.0, 0.0))
+            (elected,), _ = election.elect((group,), NOWHERE, time)
+            assert (elected.weight == group.weight) is news, (time, surprise)
+
+
+def test_only_a_surprise_prolongs_the_attention() -> None:
+    slight = TURN._replace(weight=(1.5, 400.0, 0.0, 400.0, 0.5))
+    election = Election(SETTINGS)
+    election.elect((TURN,), NOWHERE, 0.0)
+    election.elect((slight,), NOWHERE, 1.5)
+    (elected,), _ = election.elect((slight,), NOWHERE, 2.0)  # held for less than 2 s
+    assert elected.weight == (0.0, 400.0, 0.0, 400.0, 0.0)
+
+
+def test_surprise_is_of_what_steers_and_of_the_position_groups_place() -> None:
+    place = Place(2, (1.0,), (0.0,), (400.0,), 3.0)
+    mean, weight = (0.5, 9.0, -2.0, 9.0, 1.0), (4.0, 9.0, 1.0, 9.0, 3.0)
+    group = Agreement("position", 3, mean, (0.0,) * 5, weight)
+    own = 4.0 * 0.25 + 1.0 * 4.0 + 3.0 * 1.0
+    assert surprise_of(group, place) == own + 3.0
+    assert surprise_of(group._replace(group="road"), place) == own
+
+
+def test_only_the_position_group_brings_its_place() -> None:
+    place = Place(2, (1.0, 1.0), (0.0, 0.0), (400.0, 300.0), 0.0)
+    other = STRAIGHT._replace(group="position")
+    turn = TURN._replace(group="road")
+    elected, left = Election(SETTINGS).elect((other, turn), place, 0.0)
+    assert [g.weight for g in elected] == [SPEED_ONLY, turn.weight]
+    assert left == place._replace(weight=(0.0, 0.0))
+    elected, left = Election(SETTINGS).elect((TURN, STRAIGHT), place, 0.0)
+    assert left == place
+    for before, after in zip((TURN, STRAIGHT), elected, strict=True):
+        assert after[:4] == before[:4]  # what is silenced is still told
 
 
 def come_along(
