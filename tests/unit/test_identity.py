@@ -101,7 +101,7 @@ def loaded_by_a_run() -> list[str]:
 
 @pytest.fixture
 def copied(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A copy of the package, whose code is digested instead."""
+    """Make a copy of the package, whose code is digested instead."""
     package = tmp_path / "sumo_cohesion"
     ignore = shutil.ignore_patterns("__pycache__")
     shutil.copytree(ROOT / "sumo_cohesion", package, ignore=ignore)
@@ -149,7 +149,7 @@ def test_versions_count(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder for planners, on the way along which modules are looked for."""
+    """Return a folder for planners, on the way along which modules are looked for."""
     monkeypatch.syspath_prepend(tmp_path)
     return tmp_path
 
@@ -164,7 +164,7 @@ def changes(path: Path, planner: str) -> bool:
 
 def test_a_module_counts_with_all_it_imports_from_its_own_folder(own: Path) -> None:
     sources = {
-        "alone_planner.py": "import json, beside_one\nfrom beside_two import x\nimport beside_folder.y",
+        "alone_planner.py": "import json, beside_one, beside_folder.y\nfrom beside_two import x",
         "beside_one.py": "import beside_three as three",
         "beside_two.py": "import alone_planner",  # a circle
         "beside_three.py": "x = 1",
