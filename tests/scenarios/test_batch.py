@@ -66,6 +66,7 @@ def command(file: Path, out: Path, *options: str) -> list[str]:
     return [sys.executable, "-m", "sumo_cohesion", "batch", str(file), "--out", str(out), *options]
 
 
+@pytest.mark.slow
 def test_every_row_is_there_and_shared_runs_are_done_once(uninterrupted: pd.DataFrame) -> None:
     assert len(uninterrupted) == 24
     assert uninterrupted["run"].nunique() == 18
@@ -80,6 +81,7 @@ def test_every_row_is_there_and_shared_runs_are_done_once(uninterrupted: pd.Data
 STORE = "sumo_cohesion.batches.store:"
 
 
+@pytest.mark.slow
 def test_killed_at_any_moment_and_resumed_it_is_the_same(
     uninterrupted: pd.DataFrame, tmp_path: Path
 ) -> None:
@@ -106,6 +108,7 @@ def test_killed_at_any_moment_and_resumed_it_is_the_same(
     pd.testing.assert_frame_equal(results(out), uninterrupted)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
 def test_stopped_amid_runs_it_keeps_what_is_done_and_goes_on_later(
     tmp_path: Path, number: signal.Signals
@@ -147,6 +150,7 @@ def test_stopped_amid_runs_it_keeps_what_is_done_and_goes_on_later(
     pd.testing.assert_frame_equal(results(out), whole)
 
 
+@pytest.mark.slow
 def test_a_full_disk_is_one_line_and_what_was_done_stays(
     uninterrupted: pd.DataFrame, tmp_path: Path
 ) -> None:
@@ -172,6 +176,7 @@ def test_a_full_disk_is_one_line_and_what_was_done_stays(
     pd.testing.assert_frame_equal(results(out), uninterrupted)
 
 
+@pytest.mark.slow
 def test_bad_planners_are_rows_with_reasons_among_good_runs(tmp_path: Path) -> None:
     names = ["Good", "SegmentationFault", "EatsMemory", "Raises", "RaisesAtOnce"]
     experiment = {
@@ -208,6 +213,7 @@ def test_bad_planners_are_rows_with_reasons_among_good_runs(tmp_path: Path) -> N
     assert "no such road" in counted[-1].reason
 
 
+@pytest.mark.slow
 def test_a_planner_that_never_ends_is_a_row_with_a_reason(tmp_path: Path) -> None:
     """No run of this batch could end: whatever the limit and the machine, it is met."""
     endless = {
@@ -223,6 +229,7 @@ def test_a_planner_that_never_ends_is_a_row_with_a_reason(tmp_path: Path) -> Non
     assert rows["success"].isna().all()
 
 
+@pytest.mark.slow
 def test_a_dask_cluster_that_loses_a_worker_gives_the_same_rows(
     uninterrupted: pd.DataFrame, tmp_path: Path
 ) -> None:
@@ -245,6 +252,7 @@ def test_a_dask_cluster_that_loses_a_worker_gives_the_same_rows(
     pd.testing.assert_frame_equal(results(tmp_path / "out"), uninterrupted)
 
 
+@pytest.mark.slow
 def test_shards_share_a_folder_and_make_the_whole(
     uninterrupted: pd.DataFrame, tmp_path: Path
 ) -> None:
@@ -271,6 +279,7 @@ def counting(total: list[int]) -> Callable[[Progress], None]:
     return lambda progress: total.append(progress.total)
 
 
+@pytest.mark.slow
 def test_a_changed_network_is_never_mixed_with_old_results(tmp_path: Path) -> None:
     own_scenario(tmp_path)
     experiment = {
@@ -296,6 +305,7 @@ def test_a_changed_network_is_never_mixed_with_old_results(tmp_path: Path) -> No
     assert total == []
 
 
+@pytest.mark.slow
 def test_a_network_that_changes_while_it_runs_stops_no_run_from_being_true(tmp_path: Path) -> None:
     own_scenario(tmp_path)
     experiment = {
@@ -319,6 +329,7 @@ def test_a_network_that_changes_while_it_runs_stops_no_run_from_being_true(tmp_p
     assert (batch(experiment, tmp_path / "out", workers=1)["status"] == "done").all()
 
 
+@pytest.mark.slow
 def test_a_planners_own_code_decides_which_run_it_is(tmp_path: Path) -> None:
     """A package, and a module with a helper beside it: a change in either makes new runs."""
     (tmp_path / "own_package").mkdir()
@@ -353,6 +364,7 @@ def test_a_planners_own_code_decides_which_run_it_is(tmp_path: Path) -> None:
     assert len({key for keys in run_keys for key in keys}) == 4
 
 
+@pytest.mark.slow
 def test_a_planners_arguments_and_the_files_they_name_decide_which_run_it_is(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -381,6 +393,7 @@ def test_a_planners_arguments_and_the_files_they_name_decide_which_run_it_is(
     assert fast > slow + 1.0
 
 
+@pytest.mark.slow
 def test_no_run_sees_what_a_planner_remembers_of_another(tmp_path: Path) -> None:
     """A planner that forgets to forget in reset gives the same with any number of workers."""
     experiment = {
@@ -395,6 +408,7 @@ def test_no_run_sees_what_a_planner_remembers_of_another(tmp_path: Path) -> None
     assert one["mean_speed"].iloc[3] == alone["mean_speed"].iloc[0]
 
 
+@pytest.mark.slow
 def test_a_batch_whose_runs_fail_exits_with_1_and_its_summary_is_by_grid_point(
     tmp_path: Path,
 ) -> None:
@@ -415,6 +429,7 @@ def test_a_batch_whose_runs_fail_exits_with_1_and_its_summary_is_by_grid_point(
     assert "no such road" in failed.stderr
 
 
+@pytest.mark.slow
 def test_what_was_retried_with_success_is_done_whoever_failed_first(tmp_path: Path) -> None:
     small = SHORT | {"scenarios": ["stalled"], "planners": ["sumo"], "grid": {}, "seeds": [0, 1]}
     out = tmp_path / "out"
@@ -426,6 +441,7 @@ def test_what_was_retried_with_success_is_done_whoever_failed_first(tmp_path: Pa
     pd.testing.assert_frame_equal(load_metrics(out), whole)
 
 
+@pytest.mark.slow
 def test_an_interrupt_while_workers_start_does_not_wait_for_a_run(tmp_path: Path) -> None:
     """The run never ends: an interrupt that waited for it would not end either."""
     small = SHORT | {"scenarios": ["stalled"], "planners": [FAULTY + "Endless"], "grid": {}}
@@ -438,6 +454,7 @@ def test_an_interrupt_while_workers_start_does_not_wait_for_a_run(tmp_path: Path
     assert not list(tmp_path.glob("sumo-cohesion-*"))  # nor does it leave anything behind
 
 
+@pytest.mark.slow
 def test_a_reason_that_is_no_text_does_not_spoil_the_batch(tmp_path: Path) -> None:
     experiment = SHORT | {"scenarios": ["stalled"], "planners": [FAULTY + "RaisesNonsense"]}
     rows = batch(experiment | {"grid": {}, "seeds": [0]}, tmp_path / "out", workers=1)
@@ -497,6 +514,7 @@ def test_numbers_and_texts_on_one_axis_make_a_column_of_texts() -> None:
     assert set(plan["human_type.speedFactor"]) == {"1.1", "normc(1,0.1,0.2,2)"}
 
 
+@pytest.mark.slow
 def test_kept_tables_are_found_by_what_they_are_of(tmp_path: Path) -> None:
     experiment = {
         "scenarios": ["stalled"],
@@ -555,6 +573,7 @@ def test_sumos_own_outputs_come_with_one_run_too(tmp_path: Path) -> None:
     assert (both["x_front"] - both["x"]).to_numpy() == pytest.approx(2.5, abs=0.05)
 
 
+@pytest.mark.slow
 def test_a_dry_run_counts_and_keeps_nothing(tmp_path: Path) -> None:
     one = SHORT | {"scenarios": ["stalled"]}
     plan = dry_run(one, tmp_path / "out").set_index(["scenario", "planner"])
@@ -564,6 +583,7 @@ def test_a_dry_run_counts_and_keeps_nothing(tmp_path: Path) -> None:
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_two_batches_do_not_work_in_one_folder(tmp_path: Path) -> None:
     out = tmp_path / "out"
     refused: list[str] = []
@@ -580,6 +600,7 @@ def test_two_batches_do_not_work_in_one_folder(tmp_path: Path) -> None:
     assert refused
 
 
+@pytest.mark.slow
 def test_what_a_kill_has_torn_is_left_out(tmp_path: Path) -> None:
     small = SHORT | {"scenarios": ["stalled"], "planners": ["sumo"], "grid": {}, "seeds": "0:3"}
     out = tmp_path / "out"

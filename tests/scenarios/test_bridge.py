@@ -342,6 +342,7 @@ def test_own_contacts_agree_with_sumo_in_the_same_lane(tmp_path: Path) -> None:
     assert own.index(True) == pytest.approx(reported.index(True), abs=1)
 
 
+@pytest.mark.slow
 def test_curved_road_in_closed_loop(tmp_path: Path) -> None:
     """The nominal ego keeps its lane around a 500 m curve and across a junction."""
     (tmp_path / "curve.toml").write_text(

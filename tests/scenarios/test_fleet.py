@@ -16,6 +16,8 @@ from sumo_cohesion.simulation.fleet import is_equipped
 from sumo_cohesion.simulation.setup import prepare
 from sumo_cohesion.state import Control, Observation, Plan
 
+pytestmark = pytest.mark.slow
+
 HERE = "tests.scenarios.test_fleet"
 TIMED = ["plan_ms_median", "plan_ms_p99"]
 ALL = {"fleet.penetration": 1.0}

@@ -11,6 +11,8 @@ from sumo_cohesion.perception.history import History
 from sumo_cohesion.road import Road
 from sumo_cohesion.state import Control, Observation, Plan
 
+pytestmark = pytest.mark.slow
+
 
 def test_speeding_nominal_keeps_the_limit_and_cohesive_goes_with_the_flow() -> None:
     nominal = run("speeding", "nominal", 1000).metrics.iloc[0]

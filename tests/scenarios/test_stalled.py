@@ -30,6 +30,7 @@ def pair(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scenario", ["stalled", "stalled_swerve"])
 def test_nominal_hits_the_car_it_cannot_see_and_cohesive_does_not(
     pair: Path, scenario: str
@@ -43,6 +44,7 @@ def test_nominal_hits_the_car_it_cannot_see_and_cohesive_does_not(
     assert (runs["plan_failures"] <= 2).all()
 
 
+@pytest.mark.slow
 def test_the_agreement_table_says_why(pair: Path) -> None:
     rollout = Rollout.read(pair / "stalled" / "cohesive" / "seed_1000")
     ego = rollout.trajectory[rollout.trajectory["vehicle"] == "ego"]
@@ -55,6 +57,7 @@ def test_the_agreement_table_says_why(pair: Path) -> None:
     assert at_place["mean"].mean() > 0.1  # to the left, as everybody went
 
 
+@pytest.mark.slow
 def test_tables_have_the_documented_columns_and_no_surprises(pair: Path) -> None:
     rollout = Rollout.read(pair / "stalled" / "cohesive" / "seed_1000")
     for name, columns in TABLES.items():
@@ -68,6 +71,7 @@ def test_tables_have_the_documented_columns_and_no_surprises(pair: Path) -> None
     assert steps.to_numpy() == pytest.approx(0.1)
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_tables(pair: Path) -> None:
     first = Rollout.read(pair / "stalled" / "cohesive" / "seed_1001")
     again = run("stalled", "cohesive", 1001)  # another process, after other runs
@@ -78,6 +82,7 @@ def test_the_same_seed_gives_the_same_tables(pair: Path) -> None:
     )
 
 
+@pytest.mark.slow
 def test_one_worker_and_two_give_the_same_rows(tmp_path: Path) -> None:
     tables = [
         compare(
@@ -98,6 +103,7 @@ def test_one_worker_and_two_give_the_same_rows(tmp_path: Path) -> None:
             assert files[0].read_bytes() == files[1].read_bytes()
 
 
+@pytest.mark.slow
 def test_other_seeds_give_other_traffic_but_every_planner_the_same() -> None:
     short = {"duration": 2.0}
     start = {}
@@ -111,6 +117,7 @@ def test_other_seeds_give_other_traffic_but_every_planner_the_same() -> None:
     assert not start["nominal", 1].equals(start["nominal", 2])
 
 
+@pytest.mark.slow
 def test_sumo_drives_its_own_ego_around_what_it_sees() -> None:
     row = run("stalled", "sumo", 1000).metrics.iloc[0]
     assert row["success"]
@@ -152,6 +159,7 @@ class Broken(Straight):
         return plan
 
 
+@pytest.mark.slow
 def test_a_users_planner_drives() -> None:
     rollout = run("stalled", "tests.scenarios.test_stalled:Straight", 1000)
     row = rollout.metrics.iloc[0]
@@ -159,6 +167,7 @@ def test_a_users_planner_drives() -> None:
     assert row["mean_speed"] == pytest.approx(25.0, abs=0.01)
 
 
+@pytest.mark.slow
 def test_where_plans_led_is_kept_and_a_users_planner_need_not_say() -> None:
     rollout = run("stalled", "cohesive", 1, overrides={"duration": 3.0})
     horizon = rollout.horizon.set_index(["time", "stage"])
@@ -185,6 +194,7 @@ def test_a_planner_that_fails_is_braked_for_and_counted() -> None:
     assert np.isfinite(rollout.trajectory.select_dtypes("number")).all().all()
 
 
+@pytest.mark.slow
 def test_settings_by_dotted_name_reach_their_rooms() -> None:
     overrides = {
         "cohesion.beta": 0.07,
@@ -200,6 +210,7 @@ def test_settings_by_dotted_name_reach_their_rooms() -> None:
     assert info["scenario"]["randomize"]["lead_spacing"] == [40.0, 40.0]
 
 
+@pytest.mark.slow
 def test_a_run_survives_writing_and_reading(tmp_path: Path) -> None:
     rollout = run("stalled", seed=5, overrides={"duration": 1.0}, out=tmp_path / "run")
     again = Rollout.read(tmp_path / "run")
@@ -238,6 +249,7 @@ class Dying(Straight):
         os._exit(1)
 
 
+@pytest.mark.slow
 def test_a_dead_worker_is_one_line_and_finished_runs_are_kept(tmp_path: Path) -> None:
     with pytest.raises(sumo_cohesion.SimulationError, match="worker process died") as error:
         compare(
@@ -255,6 +267,7 @@ def test_a_dead_worker_is_one_line_and_finished_runs_are_kept(tmp_path: Path) ->
     assert (kept["planner"] == "sumo").all()
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="needs Linux")
 def test_workers_end_when_their_parent_is_killed(tmp_path: Path) -> None:
     gate = Gate(tmp_path / "gate")

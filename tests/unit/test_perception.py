@@ -307,4 +307,7 @@ def test_nobody_sees_itself_nor_beyond_its_reach(highway: Road) -> None:
     assert found.voter == (False, True)
     assert found.ego == pytest.approx((300.0, 0.0, 0.0, 20.0))
     assert (found.time, found.ego_size) == (4.0, (4.0, 2.0))
+    assert found.states[0] == pytest.approx([330.0, 40.0, 0.0, 20.0])
+    assert found.sizes.tolist() == [[5.0, 2.0], [6.0, 2.0]]
+    assert found.curvature.tolist() == [0.0, 0.0]
     assert overview.seen_by(3, 2.0).ids == ("c",)

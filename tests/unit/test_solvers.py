@@ -362,6 +362,7 @@ def plans(**environment: str) -> tuple[str, str]:
     return how, rest
 
 
+@pytest.mark.slow
 def test_compiled_or_not_the_plans_are_the_same_bit_for_bit(tmp_path: Path) -> None:
     if compilation._find_compiler() is None:
         pytest.skip("no C compiler here")
@@ -375,6 +376,7 @@ def test_compiled_or_not_the_plans_are_the_same_bit_for_bit(tmp_path: Path) -> N
     assert fast == slow
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("environment", "said"),
     [
@@ -394,6 +396,7 @@ def test_without_a_working_compiler_it_plans_all_the_same(
     assert len(rest.splitlines()) == 20
 
 
+@pytest.mark.slow
 def test_many_processes_compile_once(tmp_path: Path) -> None:
     if compilation._find_compiler() is None:
         pytest.skip("no C compiler here")
