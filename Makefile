@@ -5,7 +5,7 @@ NETCONVERT := $(BIN)/netconvert --offset.disable-normalization true --no-turnaro
 # Threads of the linear algebra library only cost time here: the matrices are tiny.
 export OPENBLAS_NUM_THREADS := 1
 
-.PHONY: demo test lint check faults format networks docs lock wheel benchmark benchmark-planner reproduce ablation horizon figures example clean
+.PHONY: demo test test-quick lint check faults format networks docs lock wheel benchmark benchmark-planner reproduce ablation horizon figures example clean
 
 demo: $(VENV)/.installed
 	$(BIN)/sumo-cohesion compare stalled --seeds 0:8 --out demo
@@ -13,6 +13,10 @@ demo: $(VENV)/.installed
 
 test: $(VENV)/.installed
 	$(BIN)/python -m pytest -q --cov --cov-report=term:skip-covered --cov-fail-under=85
+
+# What is quick enough for every save: half a minute.
+test-quick: $(VENV)/.installed
+	$(BIN)/python -m pytest -q -m "not slow"
 
 lint: $(VENV)/.installed
 	$(BIN)/ruff format --check .

@@ -11,14 +11,15 @@ from pathlib import Path
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import pytest
-from hypothesis import settings
+from hypothesis import HealthCheck, settings
 
 from sumo_cohesion.road import Road
 from sumo_cohesion.traffic.network import Network
 
 # A busy machine is no failure.
-settings.register_profile("any_machine", deadline=None)
-settings.register_profile("thorough", deadline=None, max_examples=2500)
+_ANY_MACHINE = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.register_profile("any_machine", _ANY_MACHINE)
+settings.register_profile("thorough", _ANY_MACHINE, max_examples=2500)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "any_machine"))
 
 ROOT = Path(__file__).resolve().parent.parent

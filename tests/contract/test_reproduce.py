@@ -11,6 +11,7 @@ import pytest
 from analysis import reproduce
 
 
+@pytest.mark.slow
 def test_a_case_is_run_once_and_its_claims_counted(tmp_path: Path) -> None:
     command = ["--cases", "speeding", "--seeds", "1000:1002", "--workers", "2"]
     folders = ["--out", str(tmp_path / "out"), "--work", str(tmp_path / "work")]

@@ -12,6 +12,7 @@ import numpy as np
 from sumo_cohesion.perception.history import History
 from sumo_cohesion.road import Road
 from sumo_cohesion.state import Control, Observation, Plan
+from tests.waiting import Gate
 
 
 class Good:
@@ -60,6 +61,17 @@ class Endless(Good):
     def fail(self) -> None:
         while True:
             time.sleep(0.01)
+
+
+class Held(Good):
+    """Waits in the middle of its run at a gate, a folder, until a test lets it pass."""
+
+    def __init__(self, gate: str) -> None:
+        self.gate = Gate(Path(gate))
+
+    def fail(self) -> None:
+        if self.steps == 11:
+            self.gate.wait_here()
 
 
 class EatsMemory(Good):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import subprocess
 import sys
+import threading
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -17,13 +18,16 @@ import pytest
 
 from sumo_cohesion import run
 from sumo_cohesion.errors import SimulationError, StoppedError, UserError
+from sumo_cohesion.perception.history import History
+from sumo_cohesion.road import Road
 from sumo_cohesion.simulation.request import RunRequest
 from sumo_cohesion.simulation.setup import prepare
-from sumo_cohesion.state import CartesianState, Scene
+from sumo_cohesion.state import CartesianState, Control, Observation, Plan, Scene
 from sumo_cohesion.tables.folders import MARKER
 from sumo_cohesion.traffic.contact import contacts
 from sumo_cohesion.traffic.simulator import Simulator, SumoRun
 from tests.conftest import NETWORKS, ROOT
+from tests.waiting import HANGS, wait_for
 
 HEAD = (
     '<routes><vType id="car" laneChangeModel="SL2015" length="5" width="1.8" speedDev="0"/>'
@@ -214,24 +218,41 @@ def test_one_simulation_per_process(tmp_path: Path) -> None:
         assert sumo.read().time == pytest.approx(0.2)
 
 
+class InTheMiddle:
+    """Drives straight on; in the middle of its run it says so, and waits to be let go."""
+
+    there, go = threading.Event(), threading.Event()
+
+    def reset(self, road: Road) -> None:
+        self.steps = 0
+
+    def plan(self, observation: Observation, history: History) -> Plan:
+        self.steps += 1
+        if self.steps == 10:
+            self.there.set()
+            assert self.go.wait(HANGS)
+        return Plan((Control(0.0, 0.1 * observation.ego.speed),), [], "straight on")
+
+
 def test_two_threads_never_share_a_simulation() -> None:
     """One of them gets its own run, whole; the other is told."""
-    alone = run("stalled", "nominal", 3, overrides={"duration": 2.0}).trajectory
 
-    def attempt(_: int) -> pd.DataFrame | str:
+    def drive() -> pd.DataFrame:
+        return run("stalled", f"{__name__}:InTheMiddle", 3, overrides={"duration": 2.0}).trajectory
+
+    InTheMiddle.go.set()
+    alone = drive()
+    InTheMiddle.there.clear()
+    InTheMiddle.go.clear()
+    with ThreadPoolExecutor(1) as thread:
         try:
-            return run("stalled", "nominal", 3, overrides={"duration": 2.0}).trajectory
-        except SimulationError as error:
-            return str(error)
-
-    for _ in range(3):
-        with ThreadPoolExecutor(2) as threads:
-            found = list(threads.map(attempt, range(2)))
-        tables = [one for one in found if isinstance(one, pd.DataFrame)]
-        assert tables
-        for table in tables:
-            pd.testing.assert_frame_equal(table, alone)
-        assert all("already running" in one for one in found if isinstance(one, str))
+            first = thread.submit(drive)
+            wait_for(lambda: InTheMiddle.there.is_set() or first.done(), what="its middle")
+            with pytest.raises(SimulationError, match="already running"):
+                drive()
+        finally:
+            InTheMiddle.go.set()
+        pd.testing.assert_frame_equal(first.result(), alone)
 
 
 def test_leaving_with_a_move_pending_does_not_crash_the_next_run(tmp_path: Path) -> None:
@@ -323,6 +344,7 @@ def test_own_contacts_agree_with_sumo_in_the_same_lane(tmp_path: Path) -> None:
     assert own.index(True) == pytest.approx(reported.index(True), abs=1)
 
 
+@pytest.mark.slow
 def test_curved_road_in_closed_loop(tmp_path: Path) -> None:
     """The nominal ego keeps its lane around a 500 m curve and across a junction."""
     (tmp_path / "curve.toml").write_text(

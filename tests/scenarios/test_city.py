@@ -47,6 +47,7 @@ def scenario(folder: Path, city: Path, destination: str, lane: int) -> Path:
     return path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("planner", ["nominal", "cohesive"])
 def test_the_ego_turns_at_a_crossing(tmp_path: Path, city: Path, planner: str) -> None:
     path = scenario(tmp_path, city, "A1B1", 0)
@@ -73,6 +74,7 @@ def test_a_turn_that_is_too_sharp_for_the_planner_says_so(tmp_path: Path, city: 
     assert len(run(path, "sumo", overrides={"duration": 15.0}).plan) == 150
 
 
+@pytest.mark.slow
 def test_the_lights_that_the_planner_does_not_know_are_said(
     tmp_path: Path, city: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:

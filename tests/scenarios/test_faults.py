@@ -14,6 +14,8 @@ from sumo_cohesion.planning.solvers import mpc
 from sumo_cohesion.state import RESCUED, FloatArray
 from sumo_cohesion.traffic.simulator import Simulator
 
+pytestmark = pytest.mark.slow
+
 KINDS = ("raises", "times out", "not a number", "infinite", "out of bounds", "noise")
 SCENARIOS = ("stalled_swerve", "speeding", "nothing_to_follow", "ambulance")
 

@@ -17,6 +17,8 @@ from sumo_cohesion.simulation.request import RunRequest
 from sumo_cohesion.simulation.setup import prepare
 from sumo_cohesion.state import Control, Observation, Plan
 
+pytestmark = pytest.mark.slow
+
 HERE = "tests.scenarios.test_fleet"
 TIMED = ["plan_ms_median", "plan_ms_p99"]
 ALL = {"fleet.penetration": 1.0}
@@ -138,7 +140,7 @@ def test_without_a_fleet_the_ego_is_alone_and_whom_egos_follow_is_nothing_to_it(
         pd.testing.assert_frame_equal(getattr(plain, name), getattr(none, name), check_exact=True)
     table, row = plain.trajectory, plain.metrics.iloc[0]
     assert (table["planned"] == (table["vehicle"] == "ego")).all()
-    assert (plain.timing["fleet_ms"] < 0.1).all()
+    assert plain.info["fleet"] == none.info["fleet"]
     assert row["fleet_size"] == row["fleet_collisions"] == row["fleet_failures"] == 0
     assert 0.0 < row["penetration"] < 0.5  # the ego alone
 

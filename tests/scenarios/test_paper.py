@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pandas as pd
 import pytest
 
 from sumo_cohesion import run
+from sumo_cohesion.perception.history import History
+from sumo_cohesion.road import Road
+from sumo_cohesion.state import Control, Observation, Plan
+
+pytestmark = pytest.mark.slow
 
 
 def test_speeding_nominal_keeps_the_limit_and_cohesive_goes_with_the_flow() -> None:
@@ -25,6 +31,30 @@ def test_exit_nominal_stays_and_cohesive_is_tricked() -> None:
     # By geometry: far from every lane of the route at the end.
     ego = cohesive.trajectory[cohesive.trajectory["vehicle"] == "ego"]
     assert ego["d"].iloc[-1] < -5.0
+
+
+class TakesTheRamp:
+    """Steers for the rightmost lane that is there in a second."""
+
+    def reset(self, road: Road) -> None:
+        self.road = road
+
+    def plan(self, observation: Observation, history: History) -> Plan:
+        ego = observation.ego
+        aim = float(np.nanmin(self.road.lanes_at([ego.s + ego.speed])[0]))
+        turn = np.arctan2(aim - ego.d, ego.speed) - ego.heading
+        control = Control(float(np.clip(turn / 5.0, -0.02, 0.02)), 0.1 * ego.speed)
+        return Plan((control,), [], "to the right")
+
+
+def test_the_ego_is_on_the_exit_once_it_is_a_lane_away_from_its_route() -> None:
+    start = {"ego.position": 980.0, "ego.speed": 15.0, "duration": 6.0, "randomize": {}}
+    rollout = run("exit", f"{__name__}:TakesTheRamp", overrides=start)
+    # The route's own rightmost lane is at d = 0 all along, and the ramp is right of it.
+    d = rollout.trajectory.query("vehicle == 'ego'")["d"].to_numpy()[:-1]
+    assert (rollout.plan["on_exit"] == (d < -3.5)).all()
+    assert ((d < -1.0) & (d > -3.5)).sum() > 5
+    assert rollout.metrics["exited"].iloc[0]
 
 
 def test_ambulance_nominal_holds_it_up_and_cohesive_makes_way() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import json
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,8 @@ import pytest
 import sumo_cohesion
 from sumo_cohesion import Rollout, compare, load_metrics, run
 from sumo_cohesion.tables.columns import TABLES
+from tests.conftest import ROOT
+from tests.waiting import Gate, is_running, started, wait_for
 
 TIMED = ["plan_ms_median", "plan_ms_p99"]
 REPEATABLE = ("trajectory", "plan", "agreement")
@@ -27,6 +30,7 @@ def pair(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scenario", ["stalled", "stalled_swerve"])
 def test_nominal_hits_the_car_it_cannot_see_and_cohesive_does_not(
     pair: Path, scenario: str
@@ -40,6 +44,7 @@ def test_nominal_hits_the_car_it_cannot_see_and_cohesive_does_not(
     assert (runs["plan_failures"] <= 2).all()
 
 
+@pytest.mark.slow
 def test_the_agreement_table_says_why(pair: Path) -> None:
     rollout = Rollout.read(pair / "stalled" / "cohesive" / "seed_1000")
     ego = rollout.trajectory[rollout.trajectory["vehicle"] == "ego"]
@@ -52,6 +57,7 @@ def test_the_agreement_table_says_why(pair: Path) -> None:
     assert at_place["mean"].mean() > 0.1  # to the left, as everybody went
 
 
+@pytest.mark.slow
 def test_tables_have_the_documented_columns_and_no_surprises(pair: Path) -> None:
     rollout = Rollout.read(pair / "stalled" / "cohesive" / "seed_1000")
     for name, columns in TABLES.items():
@@ -65,6 +71,7 @@ def test_tables_have_the_documented_columns_and_no_surprises(pair: Path) -> None
     assert steps.to_numpy() == pytest.approx(0.1)
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_tables(pair: Path) -> None:
     first = Rollout.read(pair / "stalled" / "cohesive" / "seed_1001")
     again = run("stalled", "cohesive", 1001)  # another process, after other runs
@@ -75,6 +82,7 @@ def test_the_same_seed_gives_the_same_tables(pair: Path) -> None:
     )
 
 
+@pytest.mark.slow
 def test_one_worker_and_two_give_the_same_rows(tmp_path: Path) -> None:
     tables = [
         compare(
@@ -95,6 +103,7 @@ def test_one_worker_and_two_give_the_same_rows(tmp_path: Path) -> None:
             assert files[0].read_bytes() == files[1].read_bytes()
 
 
+@pytest.mark.slow
 def test_other_seeds_give_other_traffic_but_every_planner_the_same() -> None:
     short = {"duration": 2.0}
     start = {}
@@ -108,6 +117,7 @@ def test_other_seeds_give_other_traffic_but_every_planner_the_same() -> None:
     assert not start["nominal", 1].equals(start["nominal", 2])
 
 
+@pytest.mark.slow
 def test_sumo_drives_its_own_ego_around_what_it_sees() -> None:
     row = run("stalled", "sumo", 1000).metrics.iloc[0]
     assert row["success"]
@@ -149,6 +159,7 @@ class Broken(Straight):
         return plan
 
 
+@pytest.mark.slow
 def test_a_users_planner_drives() -> None:
     rollout = run("stalled", "tests.scenarios.test_stalled:Straight", 1000)
     row = rollout.metrics.iloc[0]
@@ -156,6 +167,7 @@ def test_a_users_planner_drives() -> None:
     assert row["mean_speed"] == pytest.approx(25.0, abs=0.01)
 
 
+@pytest.mark.slow
 def test_where_plans_led_is_kept_and_a_users_planner_need_not_say() -> None:
     rollout = run("stalled", "cohesive", 1, overrides={"duration": 3.0})
     horizon = rollout.horizon.set_index(["time", "stage"])
@@ -182,6 +194,7 @@ def test_a_planner_that_fails_is_braked_for_and_counted() -> None:
     assert np.isfinite(rollout.trajectory.select_dtypes("number")).all().all()
 
 
+@pytest.mark.slow
 def test_settings_by_dotted_name_reach_their_rooms() -> None:
     overrides = {
         "cohesion.beta": 0.07,
@@ -197,6 +210,7 @@ def test_settings_by_dotted_name_reach_their_rooms() -> None:
     assert info["scenario"]["randomize"]["lead_spacing"] == [40.0, 40.0]
 
 
+@pytest.mark.slow
 def test_a_run_survives_writing_and_reading(tmp_path: Path) -> None:
     rollout = run("stalled", seed=5, overrides={"duration": 1.0}, out=tmp_path / "run")
     again = Rollout.read(tmp_path / "run")
@@ -235,6 +249,7 @@ class Dying(Straight):
         os._exit(1)
 
 
+@pytest.mark.slow
 def test_a_dead_worker_is_one_line_and_finished_runs_are_kept(tmp_path: Path) -> None:
     with pytest.raises(sumo_cohesion.SimulationError, match="worker process died") as error:
         compare(
@@ -252,39 +267,19 @@ def test_a_dead_worker_is_one_line_and_finished_runs_are_kept(tmp_path: Path) ->
     assert (kept["planner"] == "sumo").all()
 
 
-@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="needs Linux")
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="needs Linux")
 def test_workers_end_when_their_parent_is_killed(tmp_path: Path) -> None:
-    import signal
-    import subprocess
-    import sys
-    import time
-
-    code = "from sumo_cohesion import compare; compare('stalled', ('sumo',), range(500), workers=2)"
-    script = tmp_path / "batch.py"
-    script.write_text(f"if __name__ == '__main__':\n    {code}\n")
-    parent = subprocess.Popen([sys.executable, script])
-    threads = Path(f"/proc/{parent.pid}/task")
-    workers: list[str] = []
-    for _ in range(300):
-        time.sleep(0.1)
-        workers = [pid for c in threads.glob("*/children") for pid in c.read_text().split()]
-        if len(workers) >= 2:
-            break
-    assert len(workers) >= 2
-    time.sleep(3.0)
-    parent.send_signal(signal.SIGKILL)
-    parent.wait()
-    for _ in range(100):
-        alive = [pid for pid in workers if _is_running(pid)]
-        if not alive:
-            break
-        time.sleep(0.1)
-    assert alive == []
-
-
-def _is_running(pid: str) -> bool:
-    try:
-        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
-    except OSError:
-        return False
-    return state != "Z"
+    gate = Gate(tmp_path / "gate")
+    planner = f"tests.scenarios.faulty_planners:Held(gate='{gate.folder}')"
+    code = (
+        f'from sumo_cohesion import compare; compare("stalled", ["{planner}"], [0, 1], workers=2)'
+    )
+    with started([sys.executable, "-c", code], cwd=ROOT) as parent:
+        workers = wait_for(
+            lambda: pids if len(pids := gate.waiting()) == 2 else None, parent, "both runs"
+        )
+        assert all(map(is_running, workers))
+        parent.kill()
+        parent.wait()
+        wait_for(lambda: not any(map(is_running, workers)), what="the workers' end")

@@ -73,6 +73,7 @@ def planner(highway: Road) -> CohesivePlanner:
     return CohesivePlanner(SETTINGS, COHESION)
 
 
+@pytest.mark.slow
 @settings(max_examples=settings().max_examples * 4)
 @given(
     world=st.sampled_from(sorted(WORLDS)),

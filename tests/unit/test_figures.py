@@ -112,6 +112,7 @@ def test_features_show_the_maps_and_the_cars_of_that_step(
         assert np.array(shown) == pytest.approx(now[["s", "d"]].sort_values("s").to_numpy())
 
 
+@pytest.mark.slow
 def test_humans_that_only_drive_faster_are_drawn_as_speeds() -> None:
     pair = tuple(run("speeding", p, 0, overrides=SHORT) for p in ("nominal", "cohesive"))
     figure = paper.draw_scenarios([(pair[0], pair[1])])
@@ -128,6 +129,7 @@ def test_humans_that_only_drive_faster_are_drawn_as_speeds() -> None:
     assert (heights.min(), heights.max()) == (humans["speed"].min(), humans["speed"].max())
 
 
+@pytest.mark.slow
 def test_scenario_panels_show_nominal_above_cohesive_where_they_part(
     swerve: tuple[Rollout, Rollout],
 ) -> None:
@@ -154,6 +156,7 @@ def test_scenario_panels_show_nominal_above_cohesive_where_they_part(
     assert len(set(strength)) == len(strength) > 1
 
 
+@pytest.mark.slow
 def test_an_ambulance_is_drawn_beside_a_car_at_the_limit() -> None:
     pair = [run("ambulance", p, 0, overrides={"duration": 20.0}) for p in ("nominal", "cohesive")]
     upper, _ = paper.draw_scenarios([(pair[0], pair[1])]).axes
@@ -216,6 +219,7 @@ def test_precision_is_one_over_variance_and_floor_where_enough_cars_vote(
     assert len(line(right, "cohesive")) == len(drawing.ego_of(cohesive))
 
 
+@pytest.mark.slow
 def test_noise_has_a_panel_per_level_and_says_how_it_went(
     swerve: tuple[Rollout, Rollout],
 ) -> None:
@@ -269,6 +273,7 @@ def test_an_exit_ends_one_strip_of_road_and_begins_another(
     assert np.flatnonzero(np.isnan(left)).tolist() == [20]
 
 
+@pytest.mark.slow
 def test_the_same_figure_gives_the_same_file(
     tmp_path: Path, same_speed: tuple[Rollout, Rollout]
 ) -> None:

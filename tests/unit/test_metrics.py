@@ -86,6 +86,24 @@ def test_hard_brakes_count_onsets_not_steps_and_no_gaps() -> None:
     assert metrics.human_metrics(human.iloc[:0])["human_hard_brakes"] == 0
 
 
+def test_who_comes_back_slower_into_sight_has_not_braked_hard() -> None:
+    # 25 m/s, out of sight for 2 s, back with 10 m/s: 7.5 m/s² over the gap.
+    human = car("a", 20.0 * TIME)
+    human["speed"] = np.where(TIME < 2.0, 25.0, 10.0)
+    seen = human[(human["time"] < 1.95) | (human["time"] > 3.85)]
+    assert metrics.human_metrics(human)["human_hard_brakes"] == 1
+    assert metrics.human_metrics(seen)["human_hard_brakes"] == 0
+    # One step that is missing is a gap already.
+    assert metrics.human_metrics(human.drop(index=20))["human_hard_brakes"] == 0
+
+
+def test_hard_is_more_than_what_drivers_find_comfortable() -> None:
+    human = car("a", 20.0 * TIME)
+    for braking, count in ((4.49, 0), (4.5, 0), (4.51, 1)):
+        human["speed"] = 25.0 - braking * np.clip(TIME - 1.0, 0.0, 2.0)
+        assert metrics.human_metrics(human)["human_hard_brakes"] == count, braking
+
+
 def test_off_road_is_when_the_side_crosses_the_edge() -> None:
     plan = pd.DataFrame({"road_right": np.full(51, -1.75), "road_left": np.full(51, 8.75)})
     assert not metrics.off_road(car("ego", TIME, d=-0.84), plan)
@@ -158,6 +176,21 @@ def test_emergency_delay_and_yield_time_by_hand() -> None:
     assert result["yield_time"] == pytest.approx(3.0)
     nothing = metrics.emergency_metrics({**info, "events": {}}, ego, ambulance)
     assert all(np.isnan(v) for v in nothing.values())
+
+
+def test_the_ego_yields_once_it_is_half_a_lane_right_of_where_it_was() -> None:
+    info = {
+        "scenario": {"events": [{"near": "ambulance"}]},
+        "special": ["ambulance"],
+        "events": {"0": 1.0},
+    }
+    ego, ambulance = car("ego", 25.0 * TIME), car("ambulance", 33.0 * TIME)
+    for steps, expected in (([0.0, 1.74, 1.76], 3.0), ([-1.0, 0.74, 0.76], 3.0)):
+        right = np.select([TIME < 2.0, TIME < 3.95], steps[:2], steps[2])
+        ego["d"] = 7.0 - right
+        assert metrics.emergency_metrics(info, ego, ambulance)["yield_time"] == expected
+    ego["d"] = 7.0 + 2.0 * TIME  # to the left is out of the way of nobody
+    assert np.isnan(metrics.emergency_metrics(info, ego, ambulance)["yield_time"])
 
 
 RESCUE = {"special": ["ambulance"], "hidden": ["stalled"]}

@@ -12,6 +12,7 @@ from sumo_cohesion.tables import metrics
 SHORT = {"reference": True, "duration": 8.0}
 
 
+@pytest.mark.slow
 def test_nominal_changes_nothing_and_is_its_own_twin() -> None:
     row = run("same_speed", "nominal", 1000, overrides=SHORT).metrics.iloc[0]
     assert row["plan_lateral_change"] == 0.0
@@ -20,6 +21,7 @@ def test_nominal_changes_nothing_and_is_its_own_twin() -> None:
     assert row["twin_speed_deviation"] < 1e-6
 
 
+@pytest.mark.slow
 def test_cohesive_speeds_up_and_its_twin_does_not() -> None:
     rollout = run("same_speed", "cohesive", 1000, overrides=SHORT)
     row = rollout.metrics.iloc[0]
@@ -41,6 +43,7 @@ def test_without_a_reference_nothing_is_claimed() -> None:
     assert np.isnan(rollout.metrics["twin_lateral_deviation"].iloc[0])
 
 
+@pytest.mark.slow
 def test_compare_sets_each_run_beside_nominals_own() -> None:
     runs = compare("speeding", seeds=[1000], overrides={"duration": 6.0}, workers=2).runs.set_index(
         "planner"

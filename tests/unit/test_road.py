@@ -115,6 +115,7 @@ def test_a_real_motorway_maps_without_holes() -> None:
     assert np.isfinite(road.speed_limit).all()
 
 
+@pytest.mark.slow
 def test_a_way_through_a_city_has_few_columns_of_lanes(
     city: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -104,23 +104,31 @@ def test_beside_a_car_the_ego_does_not_move_closer(highway: Road) -> None:
 
 
 @pytest.mark.parametrize(
-    ("ego", "cars", "curvature"),
+    ("ego", "cars", "curvature", "better"),
     [
+        # The ego turns towards a car beside it.
+        ((100.0, 1.0, 0.0, 25.0), [(100.0, 3.2, 0.0, 25.0)], 0.01, True),
         # The nearest lane's centre, 3.5, is on the other car's side; the plan is straight on.
-        ((100.0, 1.9, 0.0, 25.0), [(100.0, 3.8, 0.0, 25.0)], 0.0),
+        ((100.0, 1.9, 0.0, 25.0), [(100.0, 3.8, 0.0, 25.0)], 0.0, False),
         # Between two cars.
-        ((100.0, -1.0, 0.0, 25.0), [(100.0, -3.05, 0.0, 25.0), (100.0, 1.1, 0.0, 25.0)], 0.0),
+        (
+            (100.0, -1.0, 0.0, 25.0),
+            [(100.0, -3.05, 0.0, 25.0), (100.0, 1.1, 0.0, 25.0)],
+            0.0,
+            False,
+        ),
         # The plan already evades as hard as it can.
-        ((100.0, -1.2, 0.05, 25.0), [(100.0, 1.1, 0.0, 25.0)], -0.01),
+        ((100.0, -1.2, 0.05, 25.0), [(100.0, 1.1, 0.0, 25.0)], -0.01, False),
         # A human merges into the ego, which evades.
-        ((100.0, 0.0, 0.0, 25.0), [(100.0, 2.1, -0.03, 25.0)], -0.01),
+        ((100.0, 0.0, 0.0, 25.0), [(100.0, 2.1, -0.03, 25.0)], -0.01, False),
     ],
 )
-def test_beside_a_car_no_plan_is_made_worse(
+def test_beside_a_car_a_plan_is_made_better_or_left_alone(
     highway: Road,
     ego: tuple[float, float, float, float],
     cars: list[tuple[float, float, float, float]],
     curvature: float,
+    better: bool,
 ) -> None:
     def least_gap(*, last_resort: bool) -> float:
         state, others, least = ego, list(cars), np.inf
@@ -143,7 +151,8 @@ def test_beside_a_car_no_plan_is_made_worse(
             least = min(least, *sides)
         return float(least)
 
-    assert least_gap(last_resort=True) >= least_gap(last_resort=False) - 1e-9
+    with_it, without = least_gap(last_resort=True), least_gap(last_resort=False)
+    assert with_it > without + 0.1 if better else with_it == without
 
 
 def test_braking_with_its_most_already_is_no_intervention(highway: Road) -> None:
@@ -177,4 +186,4 @@ def test_no_beta_buys_a_collision(highway: Road, beta: float) -> None:
         ego = tuple(float(v) for v in after)  # type: ignore[assignment]
         if abs(ego[0] - 315.0) < 5.0:
             nearest = min(nearest, abs(ego[1] - 2.6) - 1.8)
-    assert nearest > 0.0
+    assert 0.0 < nearest < np.inf  # it came past

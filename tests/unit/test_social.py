@@ -13,12 +13,12 @@ from sumo_cohesion.perception.habit import Habit
 from sumo_cohesion.perception.history import History
 from sumo_cohesion.road import Road
 from sumo_cohesion.social.agreement import Agreement, agree, combine, estimate
-from sumo_cohesion.social.election import Election
+from sumo_cohesion.social.election import Election, surprise_of
 from sumo_cohesion.social.features import DECLARED, FEATURES, social_features
 from sumo_cohesion.social.groups import Vote, group_votes
 from sumo_cohesion.social.memory import new_history
-from sumo_cohesion.social.place import NOWHERE, agree_on_place
-from sumo_cohesion.social.settings import CohesionSettings
+from sumo_cohesion.social.place import NOWHERE, Place, agree_on_place
+from sumo_cohesion.social.settings import CohesionSettings, as_printed
 from sumo_cohesion.state import Observation, RoadState
 
 SETTINGS = CohesionSettings(habit=0.0, speed_weight=1.0, place_weight=1.0)
@@ -180,10 +180,18 @@ def test_agreement_is_mean_and_unbiased_variance() -> None:
     rows = [tuple(row) for row in rng.normal(size=(6, 5)).tolist()]
     votes = [Vote(row, UNKNOWN) for row in rows]
     group, lonely = agree({"road": votes, "lane": votes[:1]}, SETTINGS)
+    assert (group.group, group.n, lonely.group) == ("road", 6, "lane")
     assert group.mean == pytest.approx(np.mean(rows, axis=0))
     assert group.variance == pytest.approx(np.var(rows, axis=0, ddof=1))
     assert group.weight == pytest.approx(1 / (np.var(rows, axis=0, ddof=1) + 2.5e-3))
-    assert (lonely.n, lonely.weight) == (1, (0.0,) * 5)
+    assert lonely == Agreement("lane", 1, (0.0,) * 5, (0.0,) * 5, (0.0,) * 5)
+
+
+def test_few_enough_cars_are_as_many_as_the_setting_says() -> None:
+    votes = [Vote((0.1,) * 5, UNKNOWN)] * 3
+    for least, heard in ((2, True), (3, True), (4, False)):
+        (group,) = agree({"road": votes}, SETTINGS.model_copy(update={"min_cars": least}))
+        assert (group.weight[0] > 0.0) is heard
 
 
 def test_perfect_agreement_has_the_floors_weight() -> None:
@@ -268,6 +276,58 @@ def test_a_surprise_keeps_attention_for_a_while() -> None:
     assert steers(TURN, 3.0)
     election.reset()
     assert not steers(slight, 3.1)
+    assert not steers(slight, 0.0)  # nor in a next run, which begins anew
+
+
+def test_what_is_no_news_is_none_while_a_surprise_is_remembered_either() -> None:
+    """Above 1 is news then, and up to 1 is not."""
+    election = Election(SETTINGS)
+    election.elect((TURN,), NOWHERE, 0.0)
+    for surprise, news in ((1.01, True), (1.0, False), (0.5, False)):
+        group = TURN._replace(weight=(surprise, 400.0, 0.0, 400.0, 0.0))
+        assert surprise_of(group, NOWHERE) == surprise
+        (elected,), _ = election.elect((group,), NOWHERE, 1.0)
+        assert (elected.weight == group.weight) is news, surprise
+
+
+def test_the_threshold_is_the_setting_where_that_is_lower() -> None:
+    election = Election(SETTINGS.model_copy(update={"surprise": 0.5}))
+    for time in (0.0, 1.0):  # at first, and while it is attentive
+        for surprise, news in ((0.51, True), (0.5, False)):
+            group = TURN._replace(weight=(surprise, 400.0, 0.0, 400.0, 0.0))
+            (elected,), _ = election.elect((group,), NOWHERE, time)
+            assert (elected.weight == group.weight) is news, (time, surprise)
+
+
+def test_only_a_surprise_prolongs_the_attention() -> None:
+    slight = TURN._replace(weight=(1.5, 400.0, 0.0, 400.0, 0.5))
+    election = Election(SETTINGS)
+    election.elect((TURN,), NOWHERE, 0.0)
+    election.elect((slight,), NOWHERE, 1.5)
+    (elected,), _ = election.elect((slight,), NOWHERE, 2.0)  # held for less than 2 s
+    assert elected.weight == (0.0, 400.0, 0.0, 400.0, 0.0)
+
+
+def test_surprise_is_of_what_steers_and_of_the_position_groups_place() -> None:
+    place = Place(2, (1.0,), (0.0,), (400.0,), 3.0)
+    mean, weight = (0.5, 9.0, -2.0, 9.0, 1.0), (4.0, 9.0, 1.0, 9.0, 3.0)
+    group = Agreement("position", 3, mean, (0.0,) * 5, weight)
+    own = 4.0 * 0.25 + 1.0 * 4.0 + 3.0 * 1.0
+    assert surprise_of(group, place) == own + 3.0
+    assert surprise_of(group._replace(group="road"), place) == own
+
+
+def test_only_the_position_group_brings_its_place() -> None:
+    place = Place(2, (1.0, 1.0), (0.0, 0.0), (400.0, 300.0), 0.0)
+    other = STRAIGHT._replace(group="position")
+    turn = TURN._replace(group="road")
+    elected, left = Election(SETTINGS).elect((other, turn), place, 0.0)
+    assert [g.weight for g in elected] == [SPEED_ONLY, turn.weight]
+    assert left == place._replace(weight=(0.0, 0.0))
+    elected, left = Election(SETTINGS).elect((TURN, STRAIGHT), place, 0.0)
+    assert left == place
+    for before, after in zip((TURN, STRAIGHT), elected, strict=True):
+        assert after[:4] == before[:4]  # what is silenced is still told
 
 
 def come_along(
@@ -321,6 +381,37 @@ def test_beyond_where_the_others_are_now_their_place_is_unknown(highway: Road) -
     place = agree_on_place(ego, h, highway, [0.1, 0.5], SETTINGS)
     assert place.weight == pytest.approx((400.0, 0.0))
     assert place.mean[0] == pytest.approx(1.6)
+
+
+def test_a_feature_on_which_nobody_has_a_vote_asks_for_nothing() -> None:
+    mean, weight = (1.0, 2.0, 3.0, 4.0, 5.0), (0.0, 0.5, 0.0, 4.0, 0.0)
+    quiet = Agreement("road", 1, mean, (0.0,) * 5, (0.0,) * 5)
+    term = combine([quiet, quiet._replace(weight=weight)])
+    assert term.weight == weight
+    assert term.target == (0.0, 2.0, 0.0, 4.0, 0.0)
+
+
+def test_the_formula_as_printed() -> None:
+    own = CohesionSettings(beta=0.3, variance_floor=0.1, lane_ahead=30.0, road_reach=40.0)
+    printed = as_printed(own)
+    changed = {k: v for k, v in printed.model_dump().items() if v != getattr(own, k)}
+    assert changed == {
+        "lateral_votes": "all",
+        "place_weight": 0.0,
+        "habit": 0.0,
+        "speed_weight": 1.0,
+        "interval": 0.1,
+        "position_length": 3.0,
+        "position_width": 1.85,
+    }
+    assert as_printed(own.model_copy(update={"transitions": "all"})).transitions == "first"
+
+
+def test_who_hardly_moves_has_hardly_a_direction() -> None:
+    # 5 cm on the way and 5 cm of standstill: the sine is 0.04 over sqrt(2) times 0.05.
+    psi = social_features((0, 0, 0, 0), (0.03, 0.04, 0, 0), 0.5)
+    assert psi[4] * SCALES[4] == pytest.approx(0.04 / (0.05 * 2**0.5))
+    assert psi[3] * SCALES[3] == pytest.approx(0.05 * 2**0.5 / 0.5)
 
 
 def test_combined_term_differs_from_the_groups_sum_by_a_constant() -> None:

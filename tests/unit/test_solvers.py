@@ -218,35 +218,41 @@ def test_the_box_problem_is_solved_exactly() -> None:
         assert value(step) <= min(value(np.array(u)) for u in product(*sides)) + 1e-12
 
 
-@settings(max_examples=settings().max_examples * 4)
-@given(
-    seed=st.integers(0, 10**6),
-    cohesion=st.sampled_from([0.0, 1.0, 1e3, 1e6]),
-    d=st.floats(-20.0, 20.0),
-    heading=st.floats(-1.5, 1.5),
-    speed=st.floats(0.0, 60.0),
-    driven=st.none() | st.tuples(st.floats(-0.01, 0.01), st.floats(-8.0, 10.0)),
-)
-def test_bounds_hold_whatever_is_asked(
-    solvers: dict[str, Mpc],
-    seed: int,
-    cohesion: float,
-    d: float,
-    heading: float,
-    speed: float,
-    driven: tuple[float, float] | None,
-) -> None:
-    instance = problem(seed, cohesion=cohesion)
-    last = None if driven is None else Control(*driven)
-    instance = instance._replace(ego=RoadState(100.0, d, heading, speed), driven=last)
-    mpc = solvers["ilqr"]
-    mpc.reset()
-    solution = mpc.solve(instance)
-    if not solution.solved:
-        assert "returned" in solution.status  # the planner then brakes in lane
-        return
-    assert np.isfinite(solution.states).all()
-    hold_limits(solution, instance)
+def test_bounds_hold_whatever_is_asked(solvers: dict[str, Mpc]) -> None:
+    solved: list[bool] = []
+
+    @settings(max_examples=settings().max_examples * 4)
+    @given(
+        seed=st.integers(0, 10**6),
+        cohesion=st.sampled_from([0.0, 1.0, 1e3, 1e6]),
+        d=st.floats(-20.0, 20.0),
+        heading=st.floats(-1.5, 1.5),
+        speed=st.floats(0.0, 60.0),
+        driven=st.none() | st.tuples(st.floats(-0.01, 0.01), st.floats(-8.0, 10.0)),
+    )
+    def ask(
+        seed: int,
+        cohesion: float,
+        d: float,
+        heading: float,
+        speed: float,
+        driven: tuple[float, float] | None,
+    ) -> None:
+        instance = problem(seed, cohesion=cohesion)
+        last = None if driven is None else Control(*driven)
+        instance = instance._replace(ego=RoadState(100.0, d, heading, speed), driven=last)
+        mpc = solvers["ilqr"]
+        mpc.reset()
+        solution = mpc.solve(instance)
+        solved.append(solution.solved)
+        if not solution.solved:
+            assert "returned" in solution.status  # the planner then brakes in lane
+            return
+        assert np.isfinite(solution.states).all()
+        hold_limits(solution, instance)
+
+    ask()
+    assert np.mean(solved) > 0.9  # or nothing has been shown
 
 
 def hold_limits(solution: Solution, instance: Problem) -> None:
@@ -358,6 +364,7 @@ def plans(**environment: str) -> tuple[str, str]:
     return how, rest
 
 
+@pytest.mark.slow
 def test_compiled_or_not_the_plans_are_the_same_bit_for_bit(tmp_path: Path) -> None:
     if compilation.find_compiler() is None:
         pytest.skip("no C compiler here")
@@ -371,6 +378,7 @@ def test_compiled_or_not_the_plans_are_the_same_bit_for_bit(tmp_path: Path) -> N
     assert fast == slow
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("environment", "said"),
     [
@@ -390,6 +398,7 @@ def test_without_a_working_compiler_it_plans_all_the_same(
     assert len(rest.splitlines()) == 20
 
 
+@pytest.mark.slow
 def test_many_processes_compile_once(tmp_path: Path) -> None:
     if compilation.find_compiler() is None:
         pytest.skip("no C compiler here")
