@@ -71,6 +71,8 @@ def run(
     with _clean_stdout():
         rollout = run_once(scenario, planner, seed, overrides=_overrides(changes), out=out, gui=gui)
     _warn_of_failures(rollout.plan)
+    for note in rollout.info["notes"]:
+        click.echo(f"note: {note}", err=True)
     lights = rollout.info["traffic_lights"]
     if lights and planner != "sumo":
         click.echo(
@@ -336,9 +338,13 @@ def export(name: str, seed: int, changes: tuple[str, ...], out: Path) -> None:
 
 
 def _overrides(changes: Sequence[str]) -> dict[str, Any]:
-    from sumo_cohesion.user_input import parse_override
+    if not changes:
+        return {}
+    from sumo_cohesion.simulation.scenario import Scenario
+    from sumo_cohesion.user_input import parse_override, text_settings
 
-    return dict(parse_override(text) for text in changes)
+    texts = text_settings(Scenario)
+    return dict(parse_override(text, texts) for text in changes)
 
 
 def _records(frame: pd.DataFrame) -> list[dict[str, Any]]:
