@@ -185,8 +185,7 @@ def randomize(
         if vehicle not in spaced:
             starts.move(vehicle, float(shift[i]))
         if vehicle in human and randomization.speed:
-            again = np.random.SeedSequence((seed, i))
-            own = _speed_factor(vehicle, types, float(temper[i]), float(choice[i]), again)
+            own = _speed_factor(vehicle, types, float(temper[i]), float(choice[i]), (seed, i))
             vehicle.set("speedFactor", f"{own * float(pace[i]):.6f}")
     for vehicle, position in zip(ahead, ego.position + np.cumsum(gaps), strict=False):
         at = starts.position(vehicle)
@@ -203,23 +202,24 @@ def _speed_factor(
     types: VehicleTypes,
     normal: float,
     choice: float,
-    again: np.random.SeedSequence,
+    again: tuple[int, int],
 ) -> float:
     """Desired speed over the limit: the vehicle's own, or drawn from its type as SUMO would.
 
     A vehicle of a distribution gets one of its types, as SUMO would give it one.
     """
-    choices = types.choices(vehicle.get("type", DEFAULT_TYPE))
-    weights = np.cumsum([weight for _, weight in choices])
-    name = choices[int(np.searchsorted(weights[:-1], choice * weights[-1], side="right"))][0]
-    if len(choices) > 1:
+    name = vehicle.get("type", DEFAULT_TYPE)
+    if types.is_distribution(name):
+        names, weights = zip(*types.choices(name), strict=True)
+        upper = np.cumsum(weights)
+        name = names[int(np.searchsorted(upper[:-1], choice * upper[-1], side="right"))]
         vehicle.set("type", name)
     own = number(vehicle.get("speedFactor"))
     return own if own is not None else _drawn(types.speed_factor(name), normal, again)
 
 
-def _drawn(factor: SpeedFactor, normal: float, again: np.random.SeedSequence) -> float:
-    """One speed factor, drawn anew while it is out of bounds, as SUMO does."""
+def _drawn(factor: SpeedFactor, normal: float, again: tuple[int, int]) -> float:
+    """One speed factor, drawn anew (seed: ``again``) while it is out of bounds, as in SUMO."""
     drawn = factor.mean + factor.deviation * normal
     if factor.low <= drawn <= factor.high:
         return drawn

@@ -75,6 +75,10 @@ class VehicleTypes:
         """Return the type of that name; None if no file has it."""
         return self._types.get(name)
 
+    def is_distribution(self, name: str) -> bool:
+        """Tell whether a name is that of a distribution of types."""
+        return name in self._distributions
+
     def choices(self, name: str, above: Sequence[str] = ()) -> list[tuple[str, float]]:
         """Types that a vehicle of this type or distribution can have; their weights add up to 1.
 

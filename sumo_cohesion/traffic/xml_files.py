@@ -10,6 +10,7 @@ import re
 import xml.etree.ElementTree as ET
 import zlib
 from collections.abc import Iterator, Sequence
+from functools import lru_cache
 from io import BufferedReader
 from pathlib import Path
 from typing import NamedTuple
@@ -103,6 +104,28 @@ def read_with_includes(path: Path) -> ET.Element:
     return _read(path, ())
 
 
+def files_behind(path: Path) -> list[Path]:
+    """Files that a route or additional file includes or reads, and those that they do."""
+    found: dict[Path, None] = {}
+    left = [path]
+    while left:
+        here = left.pop()
+        stat = here.stat()
+        named = (p.resolve() for p in _next_to_read(here, stat.st_mtime_ns, stat.st_size))
+        new = [p for p in named if p.is_file()]
+        left += [p for p in new if p not in found and p.suffix in (".xml", ".gz")]
+        found |= dict.fromkeys(new)
+    return list(found)
+
+
+@lru_cache(maxsize=256)
+def _next_to_read(path: Path, _changed: int, _size: int) -> tuple[Path, ...]:
+    root = parse_xml(path)
+    includes = [element.get("href", "") for element in root.iter("include")]
+    reads = [str(named.path) for named in named_files(root) if not named.written]
+    return tuple(path.parent / name for name in (*includes, *reads))
+
+
 def contents(root: ET.Element) -> list[ET.Element]:
     """Return what a file holds; its root is only the wrapping, whatever it is called.
 
@@ -115,7 +138,11 @@ def _read(path: Path, above: Sequence[Path]) -> ET.Element:
     here = path.resolve()
     if here in above:
         raise UserError(f"{path}: includes itself; take out the <include>")
-    root = parse_xml(path)
+    try:
+        root = parse_xml(path)
+    except UserError as error:
+        by = f"; it is included by {above[-1]}" if above else ""
+        raise UserError(f"{error}{by}") from None
     if root.tag in _OTHER_KINDS:
         raise UserError(
             f"{path}: its root element is <{root.tag}>, expected <routes> or <additional>; "
@@ -133,12 +160,7 @@ def _put_in_place(parent: ET.Element, folder: Path, above: Sequence[Path]) -> No
     children: list[ET.Element] = []
     for child in parent:
         if child.tag == "include":
-            name = child.get("href", "")
-            if not (folder / name).is_file():
-                raise UserError(
-                    f"{above[-1]}: includes {name!r}, and there is no such file beside it; mend it"
-                )
-            children += contents(_read(folder / name, above))
+            children += contents(_read(folder / child.get("href", ""), above))
         else:
             _put_in_place(child, folder, above)
             children.append(child)

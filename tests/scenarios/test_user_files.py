@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from sumo_cohesion import cli
 from sumo_cohesion.errors import UserError
 from sumo_cohesion.simulation.export import export_scenario
 from sumo_cohesion.simulation.run import run
@@ -276,3 +277,78 @@ def test_export_of_files_of_one_name(write: Write, tmp_path: Path) -> None:
         "scenario.sumocfg", "demand.rou.xml", "demand_2.rou.xml", "same.add.xml",
         "same_2.add.xml", "loops.xml",
     }  # fmt: skip
+
+
+@pytest.fixture
+def invoke(
+    capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> Callable[..., tuple[int, str]]:
+    """Call the command line: its status, and what it said."""
+
+    def call(*arguments: object) -> tuple[int, str]:
+        monkeypatch.setattr(sys, "argv", ["sumo-cohesion", *map(str, arguments)])
+        status = 0
+        try:
+            cli.main()
+        except SystemExit as stop:
+            status = int(str(stop.code))
+        return status, capfd.readouterr().err
+
+    return call
+
+
+FLOW = '<flow id="f" type="h" begin="0" period="2" from="west" to="east" departPos="200"/>'
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "setting", "needles"),
+    [
+        ("", "", "ego.speed=40", ["ego.speed = 40", "'west'", "25.00 m/s"]),
+        ("SL2015", "LC2013", "duration=1", ["vType 'h'", "'LC2013'", "SL2015"]),
+        (LEAD, FLOW, "randomize.humans=[1,2]", ["randomize.humans", "flow 'f'", "<trip>"]),
+        (LEAD, FLOW, "randomize.position=5", ["randomize.position", "flow 'f'", "random"]),
+        (HUMAN, "", "human_type.sigma=0.2", ["or additional file", "'h'"]),
+        ("", "", "ego.origin=123#0", ["no edge '123#0'"]),
+        ("", "", "ego.origin=145354574", ["no edge '145354574'"]),
+    ],
+)
+def test_mistakes_are_one_line_that_helps(
+    invoke: Callable[..., tuple[int, str]],
+    write: Write,
+    old: str,
+    new: str,
+    setting: str,
+    needles: list[str],
+) -> None:
+    text = f"<routes>{HUMAN}{WAY}{LEAD}</routes>"
+    status, said = invoke("run", write(routes=text.replace(old, new)), "--set", setting)
+    assert status == 2
+    assert said.startswith("error: ")
+    assert said.count("\n") == 1
+    for needle in needles:
+        assert needle in said
+
+
+def test_additional_files_come_first(invoke: Callable[..., tuple[int, str]], write: Write) -> None:
+    calibrator = (
+        '<calibrator id="k" edge="east" pos="0"><flow begin="0" end="9" route="r" type="h"/>'
+    )
+    status, said = invoke("run", write(k=f"{calibrator}</calibrator>"))
+    assert status == 2
+    assert "k.add.xml: uses the vehicle type 'h' of a route file, but SUMO reads additional" in said
+
+
+def test_a_run_says_what_its_seed_leaves_alone(
+    invoke: Callable[..., tuple[int, str]], write: Write
+) -> None:
+    trip = '<trip id="t" type="h" depart="0" from="west" to="east"/>'
+    scenario = write(routes=f"<routes>{HUMAN}{trip}</routes>")
+    status, said = invoke("run", scenario, "--planner", "sumo", "--set", "randomize.position=5")
+    assert status == 0
+    assert "note: randomize.position leaves trip 't' where SUMO puts it" in said
+
+
+def test_a_scenario_with_a_byte_order_mark(write: Write, tmp_path: Path) -> None:
+    scenario = write()
+    scenario.write_bytes(b"\xef\xbb\xbf" + scenario.read_bytes())
+    assert drive(scenario, tmp_path) == ["lead"]

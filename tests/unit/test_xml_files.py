@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import gzip
+import subprocess
+import sys
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
@@ -12,7 +14,7 @@ from sumo_cohesion.errors import UserError
 from sumo_cohesion.simulation.scenario import Scenario
 from sumo_cohesion.traffic.demand import read_demand
 from sumo_cohesion.traffic.network import Network
-from sumo_cohesion.traffic.xml_files import named_files, read_with_includes
+from sumo_cohesion.traffic.xml_files import files_behind, named_files, read_with_includes
 from sumo_cohesion.user_input import parse_override, read_toml, text_settings
 from tests.conftest import ROOT
 
@@ -68,7 +70,9 @@ def test_includes_are_found_beside_the_file_that_includes(tmp_path: Path) -> Non
 
 def test_includes_that_cannot_be_are_clear_errors(tmp_path: Path) -> None:
     (tmp_path / "a.xml").write_text('<routes><include href="b.xml"/></routes>')
-    with pytest.raises(UserError, match=r"a\.xml: includes 'b\.xml', and there is no such file"):
+    with pytest.raises(
+        UserError, match=r"b\.xml: cannot be read \(No such file.*included by .*a\.xml"
+    ):
         read_demand([tmp_path / "a.xml"])
     (tmp_path / "b.xml").write_text('<routes><include href="a.xml"/></routes>')
     with pytest.raises(UserError, match=r"a\.xml: includes itself"):
@@ -127,3 +131,26 @@ def test_numbers_stay_numbers() -> None:
     assert parse_override("ego.speed=20", texts) == ("ego.speed", 20)
     assert parse_override("randomize.humans=[0,0]", texts) == ("randomize.humans", [0, 0])
     assert parse_override("planner.solver=ipopt", texts) == ("planner.solver", "ipopt")
+
+
+def test_files_behind_a_file_decide_a_run_too(tmp_path: Path) -> None:
+    (tmp_path / "sub").mkdir()
+    (tmp_path / "a.xml").write_text(
+        '<additional><include href="sub/b.xml"/><inductionLoop file="loop.xml"/></additional>'
+    )
+    (tmp_path / "sub" / "b.xml").write_text(
+        '<additional><variableSpeedSign file="vss.xml"/><include href="../a.xml"/></additional>'
+    )
+    (tmp_path / "sub" / "vss.xml").write_text("<vss/>")
+    (tmp_path / "loop.xml").write_text("<written/>")
+    found = {path.resolve() for path in files_behind(tmp_path / "a.xml")}
+    assert found - {tmp_path / "a.xml"} == {tmp_path / "sub" / n for n in ("b.xml", "vss.xml")}
+
+
+def test_what_users_bring_is_read_without_pandas_and_scipy() -> None:
+    code = (
+        "import sys, sumo_cohesion.traffic.demand, sumo_cohesion.user_input;"
+        "print(sorted({'libsumo', 'sumolib', 'casadi', 'pandas', 'scipy'} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
