@@ -341,7 +341,9 @@ def _set_human_type(
                     f"human_type: no route file or additional file has the vehicle type {name!r}"
                 )
             kind = as_built_in(name)
-            demand.routes.insert(0, kind)
+            # Before anybody has it: SUMO takes it no later.
+            having = (root for root in demand.roots() if name in _kinds(root))
+            next(having, demand.roots()[0]).insert(0, kind)
         changed.add(kind)
         for key, value in attributes.items():
             kind.set(key, value if isinstance(value, str) else f"{value:.10g}")

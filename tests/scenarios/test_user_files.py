@@ -171,6 +171,17 @@ def test_human_types_of_additional_files(write: Write, tmp_path: Path) -> None:
     assert scene.states[0][3] == pytest.approx(0.4 * 25.0, abs=1.0)
 
 
+def test_human_types_that_are_built_in(write: Write, tmp_path: Path) -> None:
+    mine = LEAD.replace("type='h'", "")
+    early = mine.replace("lead", "early").replace('departLane="0"', 'departLane="1"')
+    way = WAY.replace('"r"', '"q"')
+    scenario = write(routes=f"<routes>{WAY}{mine}</routes>", cars=way + early.replace("'r'", "'q'"))
+    setup = prepare(scenario, "sumo", 0, {"human_type.length": 7.5})
+    with Simulator(setup.write_inputs(tmp_path), setup.ego_size, setup.read_radius) as sumo:
+        scene = sumo.insert_ego(1.0)
+    assert dict(zip(scene.ids, scene.sizes[:, 0], strict=True)) == {"lead": 7.5, "early": 7.5}
+
+
 def test_cars_of_a_flow_want_different_speeds(write: Write, tmp_path: Path) -> None:
     flow = (
         '<flow id="f" type="h" begin="0" period="0.5" from="west" to="east" departLane="random"/>'

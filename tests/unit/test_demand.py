@@ -113,13 +113,15 @@ def test_a_shared_type_is_a_human_type(build: Build) -> None:
 def test_distributions_and_the_default_type(build: Build) -> None:
     text = """
     <vType id="slow"/>
-    <vTypeDistribution id="mix" vTypes="slow"><vType id="fast"/></vTypeDistribution>
+    <vTypeDistribution id="mix" vTypes="slow DEFAULT_TAXITYPE"><vType id="fast"/>
+    </vTypeDistribution>
     <vehicle id="a" type="mix"/>
     <trip id="b"/>
     """
     demand = build(text, {"sigma": 0.25})
     found = types(demand)
-    assert {found[name]["sigma"] for name in ("slow", "fast", "DEFAULT_VEHTYPE")} == {"0.25"}
+    assert {found[name]["sigma"] for name in found if name != "ego"} == {"0.25"}
+    assert {*found} == {"slow", "fast", "DEFAULT_VEHTYPE", "DEFAULT_TAXITYPE", "ego"}
     assert "sigma" not in found["ego"]
     # SUMO reads in order: a type comes before the vehicles that have it.
     tags = [(element.tag, element.get("id")) for element in demand]
