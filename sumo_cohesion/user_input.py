@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import tomllib
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence, Sized
+from collections.abc import Collection, Iterable, Mapping, Sequence, Sized
 from pathlib import Path
 from typing import Any, SupportsIndex, TypeVar
 
@@ -23,7 +23,7 @@ _LONGEST = 60
 def read_toml(path: Path) -> dict[str, Any]:
     """Read a user's TOML file; raises UserError if it cannot be."""
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        return tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except OSError as error:
         raise UserError(f"{path}: cannot be read ({error.strerror})") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
@@ -82,22 +82,40 @@ def merge(data: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, An
     return result
 
 
-def parse_override(text: str) -> tuple[str, Any]:
+def parse_override(text: str, texts: Collection[str] = ()) -> tuple[str, Any]:
     """Parse ``name=value``, the value as in TOML; a bare word is a string.
+
+    ``texts`` are names whose value is a string in any case, quoted or as it stands.
 
     >>> parse_override("cohesion.beta=0.05")
     ('cohesion.beta', 0.05)
     >>> parse_override("planner.solver=ipopt")
     ('planner.solver', 'ipopt')
+    >>> parse_override("ego.origin=123#0", {"ego.origin"})
+    ('ego.origin', '123#0')
     """
     name, equals, value = text.partition("=")
     if not equals or not name.strip():
         raise UserError(f"--set {text!r}: write it as name=value, e.g. cohesion.beta=0.05")
     try:
-        parsed = tomllib.loads(f"value = {value}")["value"]
-    except tomllib.TOMLDecodeError:
-        parsed = value.strip()
-    return name.strip(), parsed
+        # In brackets, so that nothing is taken for a comment.
+        parsed, *more = tomllib.loads(f"value = [{value}]")["value"]
+    except (tomllib.TOMLDecodeError, ValueError):
+        return name.strip(), value.strip()
+    as_it_stands = more or (name.strip() in texts and not isinstance(parsed, str))
+    return name.strip(), value.strip() if as_it_stands else parsed
+
+
+def text_settings(model: type[BaseModel], group: str = "") -> set[str]:
+    """Dotted names of a model's settings that are strings."""
+    names = set()
+    for name, field in model.model_fields.items():
+        kind = field.annotation
+        if kind is str:
+            names.add(group + name)
+        elif isinstance(kind, type) and issubclass(kind, BaseModel):
+            names |= text_settings(kind, f"{group}{name}.")
+    return names
 
 
 def split_names(names: str) -> list[str]:

@@ -16,7 +16,7 @@ from sumo_cohesion.batches.workers import NO_LIMITS, CallFailedError, Workers, p
 from sumo_cohesion.errors import SimulationError, UserError
 from sumo_cohesion.planning.registry import AnyPlanner, planner_name
 from sumo_cohesion.simulation.request import RunRequest
-from sumo_cohesion.simulation.run import simulate
+from sumo_cohesion.simulation.run import record
 from sumo_cohesion.simulation.setup import prepare
 from sumo_cohesion.state import EGO
 from sumo_cohesion.tables.compared import COMPARISON_FILE, run_folder
@@ -188,8 +188,6 @@ def _results(jobs: Sequence[_Job], count: int) -> Iterator[tuple[int, _Result]]:
 
 
 def _run_job(job: _Job) -> _Result:
-    rollout = simulate(prepare(job.request))
-    if job.out is not None:
-        rollout.write(job.out)
+    rollout = record(prepare(job.request), job.out)
     table = rollout.trajectory
     return _Result(rollout.metrics, table.loc[table["vehicle"] == EGO, ["time", "d", "speed"]])

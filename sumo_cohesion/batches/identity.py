@@ -15,6 +15,7 @@ import sumo_cohesion
 from sumo_cohesion.planning.registry import BUILT_IN, WITHOUT_COHESION, parse_planner
 from sumo_cohesion.planning.solvers import SOLVERS
 from sumo_cohesion.simulation.setup import Inputs
+from sumo_cohesion.traffic.xml_files import files_behind
 from sumo_cohesion.versions import versions
 
 _WALK = (
@@ -35,11 +36,11 @@ def point_digest(inputs: Inputs) -> str:
     """
     planner = inputs.planner_name
     cohesion = inputs.cohesion.model_dump(mode="json")
+    demand = (*inputs.routes, *inputs.additional)
+    behind = [inner for path in demand for inner in files_behind(path)]
     about = {
         "scenario": inputs.scenario.model_dump(mode="json", exclude={"summary"}),
-        "files": [
-            file_digest(path) for path in (inputs.network, *inputs.routes, *inputs.additional)
-        ],
+        "files": [file_digest(path) for path in (inputs.network, *demand, *behind)],
         "planner": [planner, planner_digest(planner)],
         "settings": inputs.settings.model_dump(mode="json"),
         "cohesion": None if planner in WITHOUT_COHESION else cohesion,

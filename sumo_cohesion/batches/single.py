@@ -51,7 +51,7 @@ def _plain(value: Any) -> Any:
 
 def _notes(rollout: Rollout, planner: str) -> list[str]:
     """Return what a user should know that the metrics do not say."""
-    notes = []
+    notes = list(rollout.info["notes"])
     failed = rollout.plan[rollout.plan["fallback"]]
     if len(failed):
         notes.append(

@@ -48,6 +48,10 @@ workers = click.option(
 
 def parsed_overrides(given: Sequence[str]) -> dict[str, Any]:
     """Return settings by dotted name, from the values of --set."""
-    from sumo_cohesion.user_input import parse_override
+    if not given:
+        return {}
+    from sumo_cohesion.simulation.scenario import Scenario
+    from sumo_cohesion.user_input import parse_override, text_settings
 
-    return dict(parse_override(text) for text in given)
+    texts = text_settings(Scenario)
+    return dict(parse_override(text, texts) for text in given)

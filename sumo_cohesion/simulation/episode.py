@@ -12,6 +12,7 @@ cars are SUMO's and, if the scenario asks for them, a fleet's.
 from __future__ import annotations
 
 import contextlib
+import shutil
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -115,6 +116,8 @@ class Episode:
     setup : the run (simulation.setup.prepare).
     listeners : who is told of every step.
     gui : show SUMO's window.
+    outputs : folder that takes what the user's additional files make SUMO write, when the episode
+        is closed; without it that is lost.
 
     Raises
     ------
@@ -126,11 +129,17 @@ class Episode:
     """
 
     def __init__(
-        self, setup: Setup, listeners: Sequence[Listener] = (), *, gui: bool = False
+        self,
+        setup: Setup,
+        listeners: Sequence[Listener] = (),
+        *,
+        gui: bool = False,
+        outputs: Path | None = None,
     ) -> None:
         self._setup = setup
         self._listeners = listeners
         self._gui = gui
+        self._outputs = outputs
         self._sensor = setup.sensor
         self._open = contextlib.ExitStack()
         self.outcome = "not started"
@@ -158,6 +167,10 @@ class Episode:
         with contextlib.ExitStack() as opening:
             folder = Path(opening.enter_context(tempfile.TemporaryDirectory()))
             run = setup.write_inputs(folder, self._gui)
+            if self._outputs is not None and run.output_folder is not None:
+                opening.callback(  # once SUMO is closed, and has written the last of it
+                    shutil.copytree, run.output_folder, self._outputs, dirs_exist_ok=True
+                )
             sumo = opening.enter_context(Simulator(run, setup.ego_size, setup.read_radius))
             scene = sumo.insert_ego(latest=setup.scenario.ego.depart + _PATIENCE)
             self._open = opening.pop_all()

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from sumo_cohesion.errors import UserError
 from sumo_cohesion.simulation.request import RunRequest
 from sumo_cohesion.simulation.setup import prepare
 from sumo_cohesion.tables.folders import require_replaceable, whole_folder
@@ -23,6 +23,8 @@ def export_scenario(
 ) -> Path:
     """Write network, this seed's demand and a .sumocfg; SUMO drives the ego there.
 
+    All files that these name are copied, too. What additional files write will be beside them.
+
     Returns the path of the .sumocfg: ``sumo -c`` or ``sumo-gui -c`` opens it.
 
     Raises
@@ -31,10 +33,10 @@ def export_scenario(
         If the scenario is wrong or the folder holds something else.
     """
     target = Path(folder)
+    if "," in str(target.absolute()):
+        raise UserError(f"{target}: SUMO splits names of files at commas; choose another --out")
     require_replaceable(target)
     setup = prepare(RunRequest(scenario, "sumo", seed, overrides or {}))
     with whole_folder(target) as new:
-        setup.write_inputs(new).write_config(new / CONFIG_FILE)
-        for path in (setup.network, *setup.additional):
-            shutil.copyfile(path, new / path.name)
+        setup.write_inputs(new, portable=True).write_config(new / CONFIG_FILE)
     return target / CONFIG_FILE

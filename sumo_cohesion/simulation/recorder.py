@@ -101,6 +101,7 @@ class Recorder:
             "solver": self._plans[0][2].solver,
             "n_route_lanes": setup.road.n_route_lanes,
             "traffic_lights": list(setup.traffic_lights),
+            "notes": list(setup.notes),
             "versions": versions(),
         }
         row = run_metrics(info, trajectory, plan, agreement, timing, reference)

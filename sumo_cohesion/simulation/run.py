@@ -5,10 +5,11 @@ from __future__ import annotations
 import gc
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from xml.etree.ElementTree import ParseError
 
 from sumo_cohesion.errors import StoppedError
 from sumo_cohesion.planning.registry import AnyPlanner
@@ -66,23 +67,33 @@ def run(
     if folder is not None:  # before the drive, not after
         require_replaceable(folder)
     setup = prepare(RunRequest(scenario, planner, seed, overrides or {}))
-    with _kept(folder):
-        rollout = simulate(setup, sumo_outputs=sumo_outputs, gui=gui, listeners=listeners)
-    if folder is not None:
-        rollout.write(folder)
+    return record(setup, folder, sumo_outputs=sumo_outputs, gui=gui, listeners=listeners)
+
+
+def record(
+    setup: Setup,
+    folder: Path | None,
+    *,
+    sumo_outputs: Sequence[Output] = (),
+    gui: bool = False,
+    listeners: Sequence[Listener] = (),
+) -> Rollout:
+    """Simulate, and write all that the run leaves to a folder, also if SUMO stops it."""
+    if folder is None:
+        return simulate(setup, sumo_outputs=sumo_outputs, gui=gui, listeners=listeners)
+    with tempfile.TemporaryDirectory() as outputs:
+        users = Path(outputs)
+        try:
+            rollout = simulate(
+                setup, sumo_outputs=sumo_outputs, gui=gui, listeners=listeners, outputs=users
+            )
+        except StoppedError as error:
+            if not isinstance(error.rollout, Rollout):
+                raise
+            error.rollout.write(folder, users)
+            raise error.said(f"what was recorded until then is in {folder}") from None
+        rollout.write(folder, users)
     return rollout
-
-
-@contextmanager
-def _kept(folder: Path | None) -> Iterator[None]:
-    """Write what was recorded of a run that SUMO stopped."""
-    try:
-        yield
-    except StoppedError as error:
-        if folder is None or not isinstance(error.rollout, Rollout):
-            raise
-        error.rollout.write(folder)
-        raise error.said(f"what was recorded until then is in {folder}") from None
 
 
 def simulate(
@@ -91,24 +102,41 @@ def simulate(
     sumo_outputs: Sequence[Output] = (),
     gui: bool = False,
     listeners: Sequence[Listener] = (),
+    outputs: Path | None = None,
 ) -> Rollout:
-    """Run the loop, and add SUMO's own outputs to its tables."""
+    """Run the loop, and add SUMO's own outputs to its tables.
+
+    ``outputs`` is a folder for what the user's additional files make SUMO write.
+    """
     if not sumo_outputs:
-        return drive(setup, gui=gui, listeners=listeners)
+        return drive(setup, gui=gui, listeners=listeners, outputs=outputs)
     with tempfile.TemporaryDirectory() as folder:
-        outputs = SumoOutputs(tuple(sumo_outputs), Path(folder))
-        rollout = drive(replace(setup, outputs=outputs), gui=gui, listeners=listeners)
-        return replace(rollout, sumo=outputs.read())
+        asked = SumoOutputs(tuple(sumo_outputs), Path(folder))
+        asking = replace(setup, outputs=asked)
+        try:
+            rollout = drive(asking, gui=gui, listeners=listeners, outputs=outputs)
+        except StoppedError as error:
+            if isinstance(error.rollout, Rollout):
+                with suppress(ParseError):  # SUMO may not have come to its end
+                    error.rollout = replace(error.rollout, sumo=asked.read())
+            raise
+        return replace(rollout, sumo=asked.read())
 
 
-def drive(setup: Setup, *, gui: bool = False, listeners: Sequence[Listener] = ()) -> Rollout:
+def drive(
+    setup: Setup,
+    *,
+    gui: bool = False,
+    listeners: Sequence[Listener] = (),
+    outputs: Path | None = None,
+) -> Rollout:
     """Run the loop: observe, remember, plan, drive, step SUMO; until contact or the end."""
     history = new_history(setup.cohesion, STEP)
     ego = PlannedCar(setup.make_planner(), setup.road, history, setup.settings)
     twin: list[Twin] = [Twin(setup)] if setup.scenario.reference else []
     recorder = Recorder(setup, twin[0].rows if twin else [])
-    everybody: list[Listener] = [*twin, recorder, *listeners]
-    with _older_objects_left_alone(), Episode(setup, everybody, gui=gui) as episode:
+    run = Episode(setup, [*twin, recorder, *listeners], gui=gui, outputs=outputs)
+    with _older_objects_left_alone(), run as episode:
         try:
             observation = episode.reset()
             while not episode.outcome:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -120,8 +121,9 @@ class Scenario(_Data):
     def file(self, name: str, kind: str) -> Path:
         """Path of a network or route file, beside the scenario or bundled (kind: folder)."""
         for path in (self._folder / name, bundled(kind) / name):
-            if path.is_file():
-                return path
+            with suppress(OSError):  # no file can have such a name
+                if path.is_file():
+                    return path
         raise UserError(
             f"scenario {self.name!r}: no file {name!r} beside it ({self._folder}) nor among the "
             f"bundled {kind}"

@@ -29,8 +29,9 @@ from sumo_cohesion.traffic.demand import (
     build_demand,
     check_demand,
     check_human_type,
-    write_demand,
+    read_demand,
 )
+from sumo_cohesion.traffic.input_files import write_input_files, write_portable_files
 from sumo_cohesion.traffic.network import Network
 from sumo_cohesion.traffic.outputs import SumoOutputs
 from sumo_cohesion.traffic.simulator import SumoRun
@@ -58,7 +59,7 @@ class Setup(Inputs):
     """One run, checked and ready: everything that decides its result.
 
     ``traffic_lights`` are those of the route, which planned cars do not know; ``outputs`` only
-    adds to what is written.
+    adds to what is written; ``notes`` is what there is to say about the demand.
     """
 
     planner: AnyPlanner
@@ -67,6 +68,7 @@ class Setup(Inputs):
     road: Road
     traffic_lights: tuple[str, ...] = ()
     outputs: SumoOutputs | None = None
+    notes: tuple[str, ...] = ()
 
     @property
     def not_human(self) -> set[str]:
@@ -110,11 +112,15 @@ class Setup(Inputs):
         """Road along any route of this network; raises UserError if no car can drive along it."""
         return _road(self.network, *_version(self.network), tuple(route))
 
-    def write_inputs(self, folder: Path, gui: bool = False) -> SumoRun:
-        """Write this seed's demand and return what SUMO needs."""
+    def write_inputs(self, folder: Path, gui: bool = False, *, portable: bool = False) -> SumoRun:
+        """Write this seed's demand and return what SUMO needs.
+
+        ``portable``: all of it into the folder, which can then be moved.
+        """
         scenario = self.scenario
         demand = build_demand(
-            self.routes,
+            read_demand(self.routes, self.additional),
+            _network(self.network, *_version(self.network)),
             self.route,
             scenario.ego,
             scenario.randomize,
@@ -122,14 +128,17 @@ class Setup(Inputs):
             self.not_human,
             self.seed,
         )
+        write = write_portable_files if portable else write_input_files
+        files = write(demand, self.network, folder)
         return SumoRun(
-            network=self.network,
-            demand=write_demand(demand, folder),
-            additional=self.additional,
+            network=files.network,
+            demand=files.demand,
+            additional=files.additional,
             seed=self.seed,
             lateral_resolution=scenario.lateral_resolution,
             gui=gui,
             outputs=self.outputs,
+            output_folder=files.outputs,
         )
 
 
@@ -208,20 +217,23 @@ def prepare(request: RunRequest) -> Setup:
             "class or name instead of an object"
         )
     network = _network(inputs.network, *_version(inputs.network))
-    named = {*loaded.sensing.hidden, *loaded.sensing.special}
+    fixed = {*loaded.sensing.hidden, *loaded.sensing.special}
+    named = set(fixed)
     for event in loaded.events:
         named |= {*event.who} | ({event.near} if event.near else set())
     check_human_type(loaded.human_type)
-    route = tuple(check_demand(network, inputs.routes, loaded.ego, named))
-    road = _road(inputs.network, *_version(inputs.network), route)
+    demand = read_demand(inputs.routes, inputs.additional)
+    route, notes = check_demand(network, demand, loaded.ego, loaded.randomize, fixed, named)
+    road = _road(inputs.network, *_version(inputs.network), tuple(route))
     check_road(inputs.planner_name, inputs.settings, road, loaded.ego.position, loaded.duration)
     return Setup(
         **vars(inputs),
         planner=planner,
         seed=seed,
-        route=route,
+        route=tuple(route),
         road=road,
         traffic_lights=tuple(network.traffic_lights(route)),
+        notes=notes,
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from html import escape
@@ -51,11 +52,16 @@ class Rollout:
     def _repr_html_(self) -> str:
         return f"<p>{escape(repr(self))}</p>{self.metrics.T.to_html(header=False)}"
 
-    def write(self, folder: str | Path) -> Path:
-        """Write run.json and one parquet file per table, all of them or none."""
+    def write(self, folder: str | Path, outputs: Path | None = None) -> Path:
+        """Write run.json and one parquet file per table, all of them or none.
+
+        And the files below ``outputs``, if there are any, into the folder's "outputs".
+        """
         folder = Path(folder)
         require_replaceable(folder)
         with whole_folder(folder) as new:
+            if outputs is not None and any(outputs.iterdir()):
+                shutil.copytree(outputs, new / "outputs")
             for name in TABLES:
                 getattr(self, name).to_parquet(new / f"{name}.parquet", index=False)
             for name, table in self.sumo.items():

@@ -1,4 +1,4 @@
-"""Demand: write the route file of one run, with what its seed varies.
+"""Demand: read a scenario's route and additional files, and make of them those of one run.
 
 SUMO's demand format: https://sumo.dlr.de/docs/Definition_of_Vehicles,_Vehicle_Types,_and_Routes.html
 """
@@ -7,22 +7,38 @@ from __future__ import annotations
 
 import difflib
 import xml.etree.ElementTree as ET
-from collections.abc import Collection, Mapping, Sequence
-from math import isfinite
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
-import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from sumo_cohesion.errors import UserError
 from sumo_cohesion.state import EGO
 from sumo_cohesion.traffic.library import vehicle_type_attributes
-from sumo_cohesion.traffic.network import Network, check_xml
+from sumo_cohesion.traffic.randomize import (
+    Starts,
+    randomize,
+    refuse_what_cannot_vary,
+    seconds,
+    what_stays,
+)
+from sumo_cohesion.traffic.vehicle_types import (
+    DEFAULT_TYPE,
+    VehicleTypes,
+    as_built_in,
+    is_built_in,
+)
+from sumo_cohesion.traffic.xml_files import contents, read_with_includes
 
-DEMAND_FILE = "demand.rou.xml"
-_DEFAULT_TYPE = "DEFAULT_VEHTYPE"
-"""SUMO's type of a vehicle that names none."""
+if TYPE_CHECKING:
+    from sumo_cohesion.traffic.network import Network
+
+_FASTEST = 200 / 3.6
+"""SUMO's maxSpeed (m/s) of a car whose type says none: the ego's."""
+_WITHOUT_SUBLANES = {"LC2013", "LC2013_CC", "DK2008"}
+"""Lane change models that SUMO refuses as soon as there are sublanes."""
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
@@ -35,7 +51,8 @@ class EgoDemand(BaseModel):
     counted from the right. ``depart`` (s) leaves other traffic time to form.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    # A number is an edge's name, too: OpenStreetMap's are numbers.
+    model_config = ConfigDict(frozen=True, extra="forbid", coerce_numbers_to_str=True)
 
     origin: str
     destination: str
@@ -52,9 +69,10 @@ class Randomization(BaseModel):
 
     Attributes
     ----------
-    lead_spacing : [low, high] (m) between the fronts of consecutive cars ahead of the ego in
-        its lane, each gap drawn anew; the first gap is the ego's own.
-    position : every other vehicle starts up to so many metres before or after its place.
+    lead_spacing : [low, high] (m) between the fronts of consecutive cars that start with the
+        ego, ahead of it in its lane, each gap drawn anew; the first gap is the ego's own.
+    position : every other vehicle or trip with a number as its departPos starts up to so many
+        metres before or after it.
     speed : every human's desired speed changes by up to this share, on top of the speedDev of
         its type (SUMO itself would ignore speedDev once a vehicle has a speedFactor).
     humans : [fewest, most] human cars; the first so many of the route files are kept.
@@ -75,15 +93,88 @@ class Randomization(BaseModel):
                 raise ValueError(f"{name} must be [low, high] with low <= high, not {list(pair)}")
         return self
 
+    @property
+    def varies(self) -> bool:
+        """Whether a seed varies anything at all besides SUMO's own random numbers."""
+        return self != Randomization()
+
+
+@dataclass(frozen=True)
+class AdditionalFile:
+    """An additional file as it was read; ``changed``: it is no longer what lies on the disk."""
+
+    path: Path
+    root: ET.Element
+    changed: bool = False
+
+
+@dataclass(frozen=True)
+class Demand:
+    """What SUMO is given beside the network: all route files as one, and additional files.
+
+    ``source`` says where the routes come from, for messages.
+    """
+
+    routes: ET.Element
+    additional: tuple[AdditionalFile, ...] = ()
+    source: str = "route files"
+
+    def roots(self) -> tuple[ET.Element, ...]:
+        """All there is, in the order in which SUMO reads it: additional files come first."""
+        return (*(file.root for file in self.additional), self.routes)
+
+
+class CheckedDemand(NamedTuple):
+    """The ego's route, and what there is to say about the demand, one line each."""
+
+    route: list[str]
+    notes: tuple[str, ...]
+
+
+def read_demand(route_files: Iterable[Path], additional: Iterable[Path] = ()) -> Demand:
+    """Read route and additional files, with what they include.
+
+    Raises
+    ------
+    UserError
+        If one is missing, unreadable, not well-formed or of another kind.
+    """
+    merged, paths = ET.Element("routes"), list(route_files)
+    for path in paths:
+        merged.extend(contents(read_with_includes(path)))
+    files = []
+    for path in additional:
+        root = ET.Element("additional")
+        root.extend(contents(read_with_includes(path)))
+        files.append(AdditionalFile(path, root))
+    return Demand(merged, tuple(files), ", ".join(map(str, paths)))
+
 
 def check_demand(
-    network: Network, route_files: Sequence[Path], ego: EgoDemand, named: Collection[str]
-) -> list[str]:
+    network: Network,
+    demand: Demand,
+    ego: EgoDemand,
+    randomization: Randomization,
+    fixed: Collection[str],
+    named: Collection[str],
+) -> CheckedDemand:
     """Check the demand against the network before SUMO sees either.
 
-    Returns the ego's route. ``named`` are vehicle ids that the scenario speaks of.
+    ``fixed`` are vehicles that are not humans, ``named`` those that the scenario speaks of.
     """
     route = network.route(ego.origin, ego.destination)
+    _check_ego(network, ego)
+    _check_edges(network, demand)
+    for element in demand.routes.iter():
+        _require_finite(demand.source, element)
+    _check_names(demand, named)
+    _check_order(demand)
+    starts = Starts(demand.roots(), network)
+    refuse_what_cannot_vary(demand.routes, starts, ego, randomization, fixed)
+    return CheckedDemand(route, tuple(what_stays(demand, starts, ego, randomization, fixed)))
+
+
+def _check_ego(network: Network, ego: EgoDemand) -> None:
     n_lanes, length = network.n_lanes(ego.origin), network.edge_length(ego.origin)
     if ego.lane >= n_lanes:
         raise UserError(
@@ -99,23 +190,34 @@ def check_demand(
         raise UserError(
             f"ego.position = {ego.position:g}, but edge {ego.origin!r} is {length:.1f} m long"
         )
+    limit = min(network.speed_limit(ego.origin), _FASTEST)
+    if ego.speed > limit + 0.01:  # as much as SUMO lets pass
+        raise UserError(
+            f"ego.speed = {ego.speed:g}, but SUMO starts no car on edge {ego.origin!r} faster than "
+            f"{limit:.2f} m/s; choose at most that"
+        )
+
+
+def _check_edges(network: Network, demand: Demand) -> None:
     edges = set(network.edges())
+    for element in demand.routes.iter():
+        for edge in (element.get("edges") or "").split():
+            if edge not in edges:
+                raise UserError(
+                    f"{demand.source}: a route uses edge {edge!r}, which {network.path.name} does "
+                    "not have"
+                )
+
+
+def _check_names(demand: Demand, named: Collection[str]) -> None:
     ids: set[str] = set()
     flows: set[str] = set()
-    for path in route_files:
-        for element in check_xml(path, "routes").iter():
-            if element.tag == "route" or element.get("edges") is not None:
-                for edge in (element.get("edges") or "").split():
-                    if edge not in edges:
-                        raise UserError(
-                            f"{path}: a route uses edge {edge!r}, which {network.path.name} "
-                            "does not have"
-                        )
+    for root in demand.roots():
+        for element in root.iter():
             if element.tag in ("vehicle", "trip", "flow"):
                 (flows if element.tag == "flow" else ids).add(element.get("id", ""))
-            _require_finite(path, element)
     if EGO in ids:
-        raise UserError(f"a route file has a vehicle {EGO!r}; the scenario's [ego] adds it")
+        raise UserError(f"the demand has a vehicle {EGO!r}; the scenario's [ego] adds it")
     for name in sorted(named):
         if name in flows and name not in ids:
             raise UserError(
@@ -124,16 +226,44 @@ def check_demand(
             )
         if name not in ids and name.rpartition(".")[0] not in flows:
             raise UserError(f"the scenario names vehicle {name!r}, which no route file has")
-    return route
 
 
-def _require_finite(path: Path, element: ET.Element) -> None:
+def _check_order(demand: Demand) -> None:
+    """Refuse additional files that speak of what the route files have: SUMO reads these later."""
+    early = VehicleTypes(file.root for file in demand.additional)
+    late = VehicleTypes([demand.routes])
+    routes_early = {name for file in demand.additional for name in _routes_in(file.root)}
+    routes_late = set(_routes_in(demand.routes))
+    for file in demand.additional:
+        for element in file.root.iter():
+            kind, route = element.get("type", DEFAULT_TYPE), element.get("route")
+            if element.tag == "routeProbReroute":
+                route = element.get("id")
+            elif element.tag not in ("vehicle", "trip", "flow"):
+                continue
+            wrong = [f"vehicle type {kind!r}"] if kind not in early and kind in late else []
+            if route is not None and route not in routes_early and route in routes_late:
+                wrong.append(f"route {route!r}")
+            if wrong:
+                raise UserError(
+                    f"{file.path}: uses the {wrong[0]} of a route file, but SUMO reads additional "
+                    f"files first; put the {wrong[0]} into an additional file"
+                )
+
+
+def _routes_in(root: ET.Element) -> Iterator[str]:
+    for tag in ("route", "routeDistribution"):
+        for element in root.iter(tag):
+            yield element.get("id", "")
+
+
+def _require_finite(source: str, element: ET.Element) -> None:
     """Reject nan and inf: SUMO takes them without a word and simulates nonsense."""
     for key, text in element.attrib.items():
         if key != "id" and _not_finite(text):
             raise UserError(
-                f"{path}: {key} = {text!r} of {element.tag} {element.get('id', '')!r} is not a "
-                "finite number"
+                f"{source}: {key} = {text!r} of {element.tag} {element.get('id', '')!r} is not "
+                "a finite number"
             )
 
 
@@ -154,157 +284,103 @@ def check_human_type(attributes: Mapping[str, float | str]) -> None:
 
 
 def build_demand(
-    route_files: Sequence[Path],
+    demand: Demand,
+    network: Network,
     route: Sequence[str],
     ego: EgoDemand,
     randomization: Randomization,
     human_type: Mapping[str, float | str],
     fixed: Collection[str],
     seed: int,
-) -> ET.Element:
-    """Merge route files and the ego into one <routes>, varied by the seed.
+) -> Demand:
+    """Make the demand of one run: route files and the ego in one <routes>, varied by the seed.
 
     ``human_type`` are vType attributes for the types of all humans. ``fixed`` are vehicles that
-    are not humans (stalled cars, an ambulance): always kept, their speed unchanged. The same
-    seed always gives the same demand.
+    are not humans (stalled cars, an ambulance): always kept, their speed unchanged. What was
+    read is used up. The same seed always gives the same demand.
     """
-    merged = ET.Element("routes")
-    for path in route_files:
-        merged.extend(check_xml(path, "routes"))
-    if human_type:
-        _set_human_type(merged, human_type, fixed)
-    rng = np.random.default_rng(seed)
-    others = [v for v in merged if v.tag == "vehicle"]
-    humans = [v for v in others if v.get("id") not in fixed]
-    # Draws are made for every vehicle, kept or not, so that one setting does not shift another's.
-    shift = rng.uniform(-1.0, 1.0, len(others)) * randomization.position
-    pace = 1.0 + rng.uniform(-1.0, 1.0, len(others)) * randomization.speed
-    temper = rng.standard_normal(len(others))
-    spacing = randomization.lead_spacing
-    gaps = rng.uniform(*spacing, len(others)) if spacing else np.zeros(len(others))
-    count = (
-        rng.integers(randomization.humans[0], randomization.humans[1] + 1)
-        if randomization.humans
-        else len(humans)
+    changed = _set_human_type(demand, human_type, fixed) if human_type else set()
+    _refuse_models_without_sublanes(demand)
+    randomize(demand, Starts(demand.roots(), network), ego, randomization, fixed, seed)
+    _add_ego(demand, route, ego)
+    files = (
+        AdditionalFile(file.path, file.root, file.root in changed) for file in demand.additional
     )
-
-    leads = _leads(humans, ego) if spacing else []
-    types = {t.get("id"): t for t in merged.iter("vType")}
-    for vehicle, metres, factor, normal in zip(others, shift, pace, temper, strict=True):
-        if vehicle not in leads:
-            _shift_along(vehicle, float(metres))
-        if vehicle in humans and randomization.speed:
-            own = _speed_factor(vehicle, types, float(normal))
-            vehicle.set("speedFactor", f"{own * float(factor):.6f}")
-    for vehicle, position in zip(leads, ego.position + np.cumsum(gaps), strict=False):
-        _shift_along(vehicle, float(position) - float(vehicle.get("departPos", 0.0)))
-    for vehicle in humans[int(count) :]:
-        merged.remove(vehicle)
-    _add_ego(merged, route, ego)
-    return merged
+    return Demand(demand.routes, tuple(files))
 
 
-def write_demand(demand: ET.Element, folder: Path) -> Path:
-    """Write a demand built by build_demand and return the file's path."""
-    path = folder / DEMAND_FILE
-    ET.indent(demand)
-    ET.ElementTree(demand).write(path, encoding="UTF-8", xml_declaration=True)
-    return path
+def _kinds(root: ET.Element, but: Collection[str] = ()) -> set[str]:
+    """Names of the types that vehicles, trips and flows have."""
+    return {
+        element.get("type", DEFAULT_TYPE)
+        for element in root.iter()
+        if element.tag in ("vehicle", "trip", "flow") and element.get("id") not in but
+    }
 
 
 def _set_human_type(
-    routes: ET.Element, attributes: Mapping[str, float | str], fixed: Collection[str]
-) -> None:
-    """Set attributes on every vehicle type that a human has; types of others stay as they are."""
-    kinds = {
-        v.get("type", _DEFAULT_TYPE)
-        for v in routes
-        if v.tag in ("vehicle", "trip", "flow") and v.get("id") not in fixed
-    }
-    for distribution in routes.iter("vTypeDistribution"):
-        if distribution.get("id") in kinds:
-            kinds.discard(distribution.get("id", ""))
-            kinds |= set((distribution.get("vTypes") or "").split())
-            kinds |= {kind.get("id", "") for kind in distribution.iter("vType")}
-    types = {kind.get("id", ""): kind for kind in routes.iter("vType")}
-    for name in sorted(kinds):
-        if name == _DEFAULT_TYPE and name not in types:
-            types[name] = ET.Element("vType", id=name)
-            routes.insert(0, types[name])
-        if name not in types:
-            raise UserError(f"human_type: no route file has the vehicle type {name!r}")
-        for key, value in attributes.items():
-            types[name].set(key, value if isinstance(value, str) else f"{value:.10g}")
+    demand: Demand, attributes: Mapping[str, float | str], fixed: Collection[str]
+) -> set[ET.Element]:
+    """Set attributes on every vehicle type that a human has; types of others stay as they are.
 
-
-def _leads(humans: Sequence[ET.Element], ego: EgoDemand) -> list[ET.Element]:
-    """Humans that start ahead of the ego in its lane, nearest first."""
-
-    def position(vehicle: ET.Element) -> float:
-        return float(vehicle.get("departPos", "nan"))
-
-    ahead = [
-        v
-        for v in humans
-        if v.get("departLane") == str(ego.lane)
-        and _numeric(v.get("departPos"))
-        and position(v) > ego.position
-    ]
-    return sorted(ahead, key=position)
-
-
-def _numeric(text: str | None) -> bool:
-    try:
-        return isfinite(float(text or ""))
-    except ValueError:
-        return False
-
-
-def _speed_factor(vehicle: ET.Element, types: dict[str | None, ET.Element], normal: float) -> float:
-    """Desired speed over the limit: the vehicle's own, or drawn from its type as SUMO would.
-
-    SUMO draws from a normal distribution cut off at 0.2 and 2 (its defaults for cars).
+    Returns the roots below which something has changed.
     """
-    if _numeric(vehicle.get("speedFactor")):
-        return float(vehicle.get("speedFactor", 1.0))
-    kind = types.get(vehicle.get("type"), ET.Element("vType"))
-    mean, deviation = kind.get("speedFactor", "1.0"), kind.get("speedDev", "0.1")
-    if not (_numeric(mean) and _numeric(deviation)):
-        raise UserError(
-            f"vType {kind.get('id')!r}: speedFactor {mean!r} with speedDev {deviation!r} cannot be "
-            "combined with randomize.speed; give plain numbers"
-        )
-    return min(max(float(mean) + float(deviation) * normal, 0.2), 2.0)
+    types = VehicleTypes(demand.roots())
+    kinds = {
+        name
+        for root in demand.roots()
+        for kind in _kinds(root, fixed)
+        for name, _ in types.choices(kind)
+    }
+    changed = set()
+    for name in sorted(kinds):
+        kind = types.written(name)
+        if kind is None:
+            if not is_built_in(name):
+                raise UserError(
+                    f"human_type: no route file or additional file has the vehicle type {name!r}"
+                )
+            kind = as_built_in(name)
+            # Before anybody has it: SUMO takes it no later.
+            having = (root for root in demand.roots() if name in _kinds(root))
+            next(having, demand.roots()[0]).insert(0, kind)
+        changed.add(kind)
+        for key, value in attributes.items():
+            kind.set(key, value if isinstance(value, str) else f"{value:.10g}")
+    return {root for root in demand.roots() if not changed.isdisjoint(root.iter("vType"))}
 
 
-def _shift_along(vehicle: ET.Element, metres: float) -> None:
-    """Move a vehicle's departure, and the stop it stands at, along its lane."""
-    if metres == 0.0 or not _numeric(vehicle.get("departPos")):
-        return
-    at = max(float(vehicle.get("departPos", 0.0)) + metres, 0.0)
-    vehicle.set("departPos", f"{at:.3f}")
-    for stop in vehicle.iter("stop"):
-        for key in ("startPos", "endPos"):
-            if _numeric(stop.get(key)):
-                stop.set(key, f"{float(stop.get(key, 0.0)) + metres:.3f}")
+def _refuse_models_without_sublanes(demand: Demand) -> None:
+    types = VehicleTypes(demand.roots())
+    used = {
+        name for root in demand.roots() for kind in _kinds(root) for name, _ in types.choices(kind)
+    }
+    for name in sorted(used):
+        kind = types.written(name)
+        model = "" if kind is None else kind.get("laneChangeModel", "")
+        if model in _WITHOUT_SUBLANES:
+            raise UserError(
+                f"vType {name!r}: laneChangeModel {model!r} knows no sublanes, and the sublane "
+                "model is always on; make it SL2015"
+            )
 
 
-def _add_ego(routes: ET.Element, route: Sequence[str], ego: EgoDemand) -> None:
+def _add_ego(demand: Demand, route: Sequence[str], ego: EgoDemand) -> None:
+    """Add the ego and its type, and put all departures in the order of time that SUMO wants."""
+    name = VehicleTypes(demand.roots()).free_name(EGO)
     kind = ET.Element(
         "vType",
-        id=EGO,
+        id=name,
         laneChangeModel="SL2015",
         length=f"{ego.length:g}",
         width=f"{ego.width:g}",
         speedDev="0",
         color="orange",
     )
-    routes.insert(0, kind)
-    vehicle = ET.SubElement(
-        routes,
+    vehicle = ET.Element(
         "vehicle",
         id=EGO,
-        type=EGO,
+        type=name,
         depart=f"{ego.depart:g}",
         departLane=str(ego.lane),
         departPos=f"{ego.position:g}",
@@ -312,18 +388,12 @@ def _add_ego(routes: ET.Element, route: Sequence[str], ego: EgoDemand) -> None:
         insertionChecks="none",
     )
     ET.SubElement(vehicle, "route", edges=" ".join(route))
-    # SUMO wants departures in order of time.
-    timed = [e for e in routes if e.get("depart") or e.get("begin")]
-    for element in timed:
-        routes.remove(element)
-    routes.extend(sorted(timed, key=_departure))
+    elements = [kind, *demand.routes, vehicle]
+    timed = [e for e in elements if e.get("depart") or e.get("begin")]
+    untimed = [e for e in elements if not (e.get("depart") or e.get("begin"))]
+    demand.routes[:] = [*untimed, *sorted(timed, key=_departure)]
 
 
 def _departure(element: ET.Element) -> float:
-    """Seconds, which SUMO also takes as [days:]hours:minutes:seconds; 0 for what is no time."""
-    text = element.get("depart") or element.get("begin") or "0"
-    parts = text.split(":")
-    if len(parts) not in (1, 3, 4) or not all(map(_numeric, parts)):
-        return 0.0
-    units = (1.0, 60.0, 3600.0, 86_400.0)
-    return sum(float(part) * unit for part, unit in zip(reversed(parts), units, strict=False))
+    """Seconds; 0 for what is no time."""
+    return seconds(element.get("depart") or element.get("begin")) or 0.0

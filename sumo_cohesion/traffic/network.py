@@ -5,7 +5,6 @@ Network file format: https://sumo.dlr.de/docs/Networks/SUMO_Road_Networks.html
 
 from __future__ import annotations
 
-import xml.etree.ElementTree as ET
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -20,6 +19,7 @@ from sumo_cohesion.errors import UserError
 from sumo_cohesion.road import SPACING, Road
 from sumo_cohesion.state import FloatArray, IntArray
 from sumo_cohesion.traffic.network_check import check_network
+from sumo_cohesion.traffic.xml_files import check_xml
 
 EXTENSION = 100.0
 """Straight metres added to both ends of the reference line, so that cars near them project."""
@@ -31,30 +31,6 @@ SMOOTHING = 4.0
 """Standard deviation (m) of the filter that rounds the kinks of a polyline. It moves a curve of
 radius R inwards by SMOOTHING²/2R (2 cm at 400 m); the lanes, measured in the same frame, are
 where they were."""
-
-
-def check_xml(path: Path, root: str) -> ET.Element:
-    """Parse an XML file and check its root element, before SUMO sees it.
-
-    A malformed network kills the whole process inside SUMO, so this must come first.
-
-    Raises
-    ------
-    UserError
-        If the file is missing, unreadable, not well-formed or of another kind.
-    """
-    try:
-        element = ET.parse(path).getroot()
-    except OSError as error:
-        raise UserError(f"{path}: cannot be read ({error.strerror})") from None
-    except (ET.ParseError, UnicodeDecodeError, ValueError) as error:
-        raise UserError(
-            f"{path}: not well-formed XML ({error}); the file is truncated or damaged, "
-            "write it again"
-        ) from None
-    if element.tag != root:
-        raise UserError(f"{path}: its root element is <{element.tag}>, expected <{root}>")
-    return element
 
 
 class Network:
@@ -97,6 +73,10 @@ class Network:
     def edge_length(self, edge: str) -> float:
         """Length (m) of an edge."""
         return float(self._edge(edge).getLength())
+
+    def speed_limit(self, edge: str) -> float:
+        """Highest speed limit (m/s) of an edge's lanes."""
+        return max(float(lane.getSpeed()) for lane in self._edge(edge).getLanes())
 
     def route(self, origin: str, destination: str) -> list[str]:
         """Edges of the shortest route for cars between two edges, both included."""

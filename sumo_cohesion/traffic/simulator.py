@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import threading
+import xml.etree.ElementTree as ET
 from collections.abc import Mapping
 from dataclasses import dataclass
 from math import cos, degrees, hypot, inf, isfinite, pi, radians, sin
@@ -44,7 +45,11 @@ class _Manners(NamedTuple):
 
 @dataclass(frozen=True)
 class SumoRun:
-    """What SUMO needs to start one run."""
+    """What SUMO needs to start one run.
+
+    ``output_folder`` is where SUMO writes what the additional files ask for (detectors and the
+    like), to the end when it is closed; None if they ask for nothing.
+    """
 
     network: Path
     demand: Path
@@ -53,6 +58,7 @@ class SumoRun:
     lateral_resolution: float
     gui: bool = False
     outputs: SumoOutputs | None = None
+    output_folder: Path | None = None
 
     def options(self) -> list[str]:
         """SUMO's command line, without the program.
@@ -75,6 +81,12 @@ class SumoRun:
             "no-warnings": "true",
             "duration-log.disable": "true",
         }
+        for path in (self.network, self.demand, *self.additional):
+            if "," in str(path):
+                raise UserError(
+                    f"SUMO splits names of files at commas, and {str(path)!r} has one; rename its "
+                    "folder, or for temporary files set TMPDIR to another"
+                )
         if self.additional:
             pairs["additional-files"] = ",".join(map(str, self.additional))
         if self.outputs is not None:
@@ -84,14 +96,14 @@ class SumoRun:
 
     def write_config(self, path: Path) -> None:
         """Write a .sumocfg that opens this run in plain SUMO, with SUMO driving the ego."""
-        lines = ['<?xml version="1.0" encoding="UTF-8"?>', "<sumoConfiguration>"]
+        root = ET.Element("sumoConfiguration")
         options = self.options()
         for key, value in zip(options[::2], options[1::2], strict=True):
             if key in ("--net-file", "--route-files", "--additional-files"):
                 value = ",".join(Path(p).name for p in value.split(","))
-            lines.append(f'    <{key[2:]} value="{value}"/>')
-        lines.append("</sumoConfiguration>")
-        path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+            ET.SubElement(root, key[2:], value=value)
+        ET.indent(root, "    ")
+        ET.ElementTree(root).write(path, encoding="UTF-8", xml_declaration=True)
 
 
 class Simulator:

@@ -410,8 +410,8 @@ def test_the_formula_as_printed() -> None:
 def test_who_hardly_moves_has_hardly_a_direction() -> None:
     # 5 cm on the way and 5 cm of standstill: the sine is 0.04 over sqrt(2) times 0.05.
     psi = social_features((0, 0, 0, 0), (0.03, 0.04, 0, 0), 0.5)
-    assert psi[4] * SCALES[4] == pytest.approx(0.04 / (0.05 * 2**0.5))
-    assert psi[3] * SCALES[3] == pytest.approx(0.05 * 2**0.5 / 0.5)
+    assert psi[4] * DECLARED[4].scale == pytest.approx(0.04 / (0.05 * 2**0.5))
+    assert psi[3] * DECLARED[3].scale == pytest.approx(0.05 * 2**0.5 / 0.5)
 
 
 def test_combined_term_differs_from_the_groups_sum_by_a_constant() -> None:
