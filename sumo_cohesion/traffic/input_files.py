@@ -42,7 +42,7 @@ def write_input_files(demand: Demand, network: Path, folder: Path) -> InputFiles
     names = _Names()
     writers = _redirected(demand, lambda path: str(outputs / names.of(path)))
     if writers:
-        outputs.mkdir()
+        outputs.mkdir(exist_ok=True)
     additional = []
     for i, file in enumerate(demand.additional):
         if file.changed or file.root in writers or "," in str(file.path):
@@ -124,6 +124,7 @@ class _Names:
 
 def _link(path: Path, link: Path) -> Path:
     """Link to a file by another name, or copy it where links cannot be made."""
+    link.unlink(missing_ok=True)
     with contextlib.suppress(OSError):
         link.symlink_to(path.resolve())
         return link
