@@ -5,7 +5,7 @@ NETCONVERT := $(BIN)/netconvert --offset.disable-normalization true --no-turnaro
 # Threads of the linear algebra library only cost time here: the matrices are tiny.
 export OPENBLAS_NUM_THREADS := 1
 
-.PHONY: demo test test-quick lint check faults format networks docs lock wheel benchmark benchmark-planner reproduce ablation horizon figures example clean
+.PHONY: demo test test-quick lint check faults fuzz format networks docs lock wheel benchmark benchmark-planner reproduce ablation horizon figures example clean
 
 demo: $(VENV)/.installed
 	$(BIN)/sumo-cohesion compare stalled --seeds 0:8 --out demo
@@ -28,6 +28,13 @@ check: lint test
 # Ten thousand random problems and as many random scenes, some minutes; make test tries 400 each.
 faults: $(VENV)/.installed
 	HYPOTHESIS_PROFILE=thorough $(BIN)/python -m pytest -q tests/unit/test_faults.py tests/unit/test_solvers.py
+
+# Damage inputs and results, each in its own way, and see that every command ends in one clear
+# line: some ten minutes. make test tries 200.
+N ?= 2000
+SEED ?= 0
+fuzz: $(VENV)/.installed
+	$(BIN)/python -m fuzz -n $(N) --seed $(SEED)
 
 format: $(VENV)/.installed
 	$(BIN)/ruff format .

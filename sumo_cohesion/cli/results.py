@@ -26,8 +26,10 @@ from sumo_cohesion.errors import UserError
 def metrics(folder: Path, style: str, out: Path | None) -> None:
     """Print or convert the metrics of all runs below FOLDER."""
     from sumo_cohesion.batches.results import load_metrics
+    from sumo_cohesion.tables.damaged import tables_of
 
-    frame = load_metrics(folder)
+    with tables_of(folder):
+        frame = load_metrics(folder)
     if style == "parquet":
         if out is None:
             raise UserError("--format parquet writes a file; name it with --out")
@@ -64,15 +66,19 @@ def figure(
 ) -> None:
     """Draw the picture of a run, a comparison or a batch from its saved tables."""
     from sumo_cohesion.batches.store import is_batch
+    from sumo_cohesion.tables.damaged import tables_of
 
     if is_batch(folder):
         if metric is None or over is None:
             raise UserError(f"{folder}: is a batch; say what to draw with --metric and --over")
         from sumo_cohesion.batches.results import load_metrics
         from sumo_cohesion.report.grid import draw_grid
+        from sumo_cohesion.tables.folders import claim
 
-        picture = out or folder / f"{metric}.png"
-        click.echo(draw_grid(load_metrics(folder), metric, over, panels, picture))
+        with tables_of(folder):
+            picture = out or claim(folder, f"{metric}.png")
+            path = draw_grid(load_metrics(folder), metric, over, panels, picture)
+        click.echo(path)
         return
     from sumo_cohesion.report.paths import draw_comparison, draw_run
 
@@ -80,7 +86,9 @@ def figure(
     draw = draw_comparison if (folder / "comparison.json").is_file() else draw_run
     if draw is draw_run and seed is not None:
         raise UserError(f"{folder}: one run has one seed; leave --seed out")
-    path = draw_comparison(folder, out, seed) if draw is draw_comparison else draw_run(folder, out)
+    with tables_of(folder):
+        both = draw is draw_comparison
+        path = draw_comparison(folder, out, seed) if both else draw_run(folder, out)
     click.echo(path)
 
 

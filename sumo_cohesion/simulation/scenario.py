@@ -88,7 +88,7 @@ class Scenario(_Data):
     routes: Annotated[tuple[str, ...], Field(min_length=1)]
     additional: tuple[str, ...] = ()
     duration: Annotated[float, Field(ge=1, le=86_400)]
-    lateral_resolution: Annotated[float, Field(gt=0, le=10)] = 0.8
+    lateral_resolution: Annotated[float, Field(ge=0.01, le=10)] = 0.8
     ego: EgoDemand
     sensing: Sensing = Sensing()
     fleet: FleetSettings = FleetSettings()

@@ -59,7 +59,7 @@ class EgoDemand(BaseModel):
     lane: Annotated[int, Field(ge=0)]
     position: NonNegative
     speed: NonNegative
-    depart: NonNegative = 0.0
+    depart: Annotated[float, Field(ge=0, le=604_800)] = 0.0  # a week, most of it empty steps
     length: Positive = 5.0
     width: Positive = 1.8
 

@@ -373,7 +373,12 @@ class Simulator:
     def _size(self, name: str) -> tuple[float, float]:
         if name not in self._sizes:
             vehicle = self._sumo.vehicle
-            self._sizes[name] = (float(vehicle.getLength(name)), float(vehicle.getWidth(name)))
+            size = (float(vehicle.getLength(name)), float(vehicle.getWidth(name)))
+            if not all(map(isfinite, size)):
+                raise UserError(
+                    f"vehicle {name!r} is {size[0]:g} m long and {size[1]:g} m wide; mend its type"
+                )
+            self._sizes[name] = size
         return self._sizes[name]
 
     @staticmethod

@@ -91,6 +91,8 @@ ROUTES = (ROOT / "routes" / "stalled.rou.xml").read_text()
         ("duration = 40.0", "duration = -1.0", ["duration", "greater than"]),
         ("duration = 40.0", "duration = nan", ["duration"]),
         ("duration = 40.0", "duraton = 40.0", ["duraton", "duration"]),
+        ("duration = 40.0", "duration = 40\nlateral_resolution = 1e-6", ["lateral_resolution"]),
+        ("speed = 25.0", "speed = 25.0\ndepart = 1e9", ["ego.depart", "604800"]),
         ("speed = 25.0", "sped = 25.0", ["ego.sped", "speed"]),
         ("lane = 0", "lane = 7", ["ego.lane = 7", "lanes 0 to 2"]),
         ("lane = 0", "lane = -1", ["ego.lane"]),
@@ -262,8 +264,28 @@ def test_no_screen_for_the_window(invoke: Invoke, monkeypatch: pytest.MonkeyPatc
     assert_one_line(invoke("run", "stalled", "--gui"), "--gui", "scenario export")
 
 
+@pytest.mark.parametrize("key", ["length", "width"])
+def test_a_vehicle_of_infinite_size(
+    invoke: Invoke, scenario: Callable[..., Path], key: str
+) -> None:
+    Path("more.add.xml").write_text(
+        f'<additional><vType id="endless" laneChangeModel="SL2015" {key}="inf"/>'
+        '<vehicle id="odd" type="endless" depart="0" departLane="2" departPos="300">'
+        '<route edges="west east"/></vehicle></additional>'
+    )
+    path = scenario("duration = 40.0", 'duration = 2.0\nadditional = ["more.add.xml"]')
+    assert_one_line(invoke("run", path, "--planner", "sumo"), "'odd'", "inf m", "mend its type")
+
+
 def test_damaged_results_say_so(invoke: Invoke) -> None:
+    import pandas as pd
+
     assert invoke("run", "stalled", "--set", "duration=1.0", "--out", "run")[0] == 0
+    table = Path("run") / "trajectory.parquet"
+    whole = pd.read_parquet(table)
+    for damaged in (whole.drop(columns="d"), whole.iloc[:0], whole.iloc[:1]):
+        damaged.to_parquet(table)
+        assert_one_line(invoke("figure", "run"), "run", "not those that were written", "run it")
     (Path("run") / "trajectory.parquet").write_bytes(b"junk")
     assert_one_line(invoke("figure", "run"), "not a complete run")
     (Path("run") / "metrics.parquet").write_bytes(b"junk")
