@@ -556,6 +556,7 @@ def test_kept_tables_are_found_by_what_they_are_of(tmp_path: Path) -> None:
         load_trajectories(out, {"seed": 99})
 
 
+@pytest.mark.slow
 def test_sumos_own_outputs_come_with_one_run_too(tmp_path: Path) -> None:
     rollout = run("stalled", "nominal", 0, sumo_outputs=("fcd", "ssm"), out=tmp_path / "run")
     conflicts = rollout.sumo["ssm"]

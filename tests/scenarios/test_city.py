@@ -65,6 +65,7 @@ def test_the_ego_turns_at_a_crossing(tmp_path: Path, city: Path, planner: str) -
     assert corner["speed"].min() < 10.0 < ego["speed"].max()
 
 
+@pytest.mark.slow
 def test_a_turn_that_is_too_sharp_for_the_planner_says_so(tmp_path: Path, city: Path) -> None:
     path = scenario(tmp_path, city, "A1B1", 0)
     with pytest.raises(UserError, match=r"radius of \d+ m, and planner.max_curvature = 0.01"):
@@ -99,6 +100,7 @@ class StraightOn:
         return Plan((Control(0.0, 0.1 * observation.ego.speed),), [], "straight on")
 
 
+@pytest.mark.slow
 def test_a_run_ends_when_the_ego_has_left_its_route_and_every_lane_off_it(
     tmp_path: Path, city: Path
 ) -> None:
@@ -119,6 +121,7 @@ def test_what_a_road_cannot_be_told_of_or_driven_along_says_so(tmp_path: Path, c
             run(path, planner)
 
 
+@pytest.mark.slow
 def test_the_scenario_speaks_of_a_flows_vehicles_not_of_the_flow(
     tmp_path: Path, city: Path
 ) -> None:

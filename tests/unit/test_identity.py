@@ -179,6 +179,15 @@ def test_a_module_counts_with_all_it_imports_from_its_own_folder(own: Path) -> N
         assert changes(own / name, "alone_planner:Mine") is (name != "stranger.py"), name
 
 
+def test_a_planners_code_is_part_of_its_runs(own: Path, digest: Callable[..., str]) -> None:
+    path = own / "lone_planner.py"
+    path.write_text("x = 1")
+    before = digest("lone_planner:Mine")
+    path.write_text("x = 21")
+    assert digest("lone_planner:Mine") != before
+    assert digest("lone_planner:Mine(gain=2)") != digest("lone_planner:Mine")
+
+
 def test_a_package_counts_as_a_whole(own: Path) -> None:
     for name in ("whole_package/__init__.py", "whole_package/deep/er.py", "stranger.py"):
         (own / name).parent.mkdir(parents=True, exist_ok=True)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from sumo_cohesion.perception.habit import Habit
-from sumo_cohesion.perception.history import History
+from sumo_cohesion.perception.history import History, State
 from sumo_cohesion.road import Road
 from sumo_cohesion.social.agreement import Agreement, agree, combine, estimate
 from sumo_cohesion.social.election import Election, surprise_of
@@ -163,6 +163,94 @@ def test_groups_who_votes_where(highway: Road) -> None:
     assert len(votes["road"]) == 4
 
 
+def told(before: State, after: State, seconds: float, curvature: float) -> tuple[float, ...]:
+    """Describe a transition by where it began and ended."""
+    return before[0], after[0]
+
+
+def remembered(cars: dict[str, list[tuple[float, float, float]]]) -> History:
+    """Remember cars by name: s, d, heading in each of the last steps; transitions of one step."""
+    h = History(0.1, 0.1, 20.0, told, lambda: Habit((0.0,) * 2, 0, 0))
+    steps = max(map(len, cars.values()))
+    for k in range(steps):
+        now = {n: rows[k - steps] for n, rows in cars.items() if steps - k <= len(rows)}
+        seen = observe(0.1 * k, {n: (s, d, 20.0) for n, (s, d, _) in now.items()})
+        seen.states[:, 2] = [heading for *_, heading in now.values()]
+        h.push(seen)
+    return h
+
+
+def voters(votes: dict[str, list[Vote]], group: str) -> list[float]:
+    """Tell who votes, by where it is now."""
+    return [vote.features[1] for vote in votes[group]]
+
+
+REACH = CohesionSettings(
+    lane_ahead=30.0, lane_behind=10.0, road_reach=20.0, position_length=5.0, position_width=2.0
+)
+HERE = RoadState(300.0, 0.0, 0.0, 25.0)
+
+
+@pytest.mark.parametrize(
+    ("reaches", "s", "lane", "road"),
+    [
+        ((30.0, 10.0, 20.0), (289.9, 290.0, 320.0, 320.1, 330.0, 330.1), (290, 320, 320.1, 330),
+         (289.9, 290, 320)),
+        ((30.0, 10.0, 40.0), (259.9, 260.0, 340.0, 340.1), (), (260, 340)),
+        ((30.0, 50.0, 20.0), (249.9, 250.0, 279.9, 280.0), (250, 279.9, 280), (280,)),
+    ],
+)  # fmt: skip
+def test_reaches_are_to_the_metre_and_whichever_is_farthest(
+    highway: Road,
+    reaches: tuple[float, float, float],
+    s: tuple[float, ...],
+    lane: tuple[float, ...],
+    road: tuple[float, ...],
+) -> None:
+    ahead, behind, around = reaches
+    update = {"lane_ahead": ahead, "lane_behind": behind, "road_reach": around}
+    # Standing still, so that a car is where it was: headings are as reported.
+    h = remembered({f"car_{x}": [(x, 0.0, 0.0)] * 2 for x in s})
+    votes = group_votes(HERE, h, highway, REACH.model_copy(update=update))
+    assert voters(votes, "lane") == list(lane)
+    assert voters(votes, "road") == list(road)
+
+
+def test_who_comes_the_other_way_has_no_vote_and_who_drives_aslant_has(highway: Road) -> None:
+    headings = {"aslant": 1.5, "back": 1.6, "oncoming": np.pi, "right": -1.5, "across": np.pi / 2}
+    h = remembered({n: [(300.0 + i, 0.0, x)] * 2 for i, (n, x) in enumerate(headings.items())})
+    votes = group_votes(HERE, h, highway, REACH)
+    for group in ("position", "lane", "road"):
+        assert voters(votes, group) == [300.0, 303.0, 304.0], group
+
+
+def test_who_is_new_has_no_vote_yet_and_keeps_nobody_from_voting(highway: Road) -> None:
+    h = remembered({"new": [(301.0, 0.0, 0.0)], "old": [(302.0, 0.0, 0.0)] * 2})
+    votes = group_votes(HERE, h, highway, REACH)
+    for group in ("position", "lane", "road"):
+        assert voters(votes, group) == [302.0], group
+
+
+def test_a_vote_is_the_newest_transition_with_the_newest_habit(highway: Road) -> None:
+    h = remembered({"a": [(296.0, 0.0, 0.0), (298.0, 0.0, 0.0), (301.0, 0.0, 0.0)]})
+    (track,) = h.in_sight()
+    track.habits[:] = [(1.0, 1.0), (2.0, 3.0)]
+    votes = group_votes(HERE, h, highway, REACH)
+    assert votes["lane"] == votes["road"] == [Vote((298.0, 301.0), (2.0, 3.0))]
+
+
+def test_the_vote_of_a_place_is_the_mean_of_what_was_done_there(highway: Road) -> None:
+    # Middles at 297 (d 0), 299 (d 4.1), 301 (d 7.5), 303 (d 6.9): near d = 6.1 are the last three.
+    way = [(296.0, -0.9), (298.0, 0.9), (300.0, 7.3), (302.0, 7.7), (304.0, 6.1)]
+    h = remembered({"a": [(s, d, 0.0) for s, d in way]})
+    (track,) = h.in_sight()
+    track.habits[:] = [(float(i), 0.0) for i in range(4)]
+    for d, expected in ((6.1, (300.0, 302.0, 1.0)), (-2.0, (296.0, 298.0, 0.0))):
+        (vote,) = group_votes(HERE._replace(d=d), h, highway, REACH)["position"]
+        assert (*vote.features, vote.habit[0]) == pytest.approx(expected), d
+    assert group_votes(HERE._replace(d=-2.1), h, highway, REACH)["position"] == []
+
+
 def test_special_and_oncoming_vehicles_do_not_vote(highway: Road) -> None:
     h = history()
     for k in range(10):
@@ -248,6 +336,18 @@ def test_without_habits_nobody_has_any() -> None:
     assert max(track.habits[-1]) < 0.02
 
 
+def test_a_habit_is_of_so_many_seconds_and_begins_after_its_delay() -> None:
+    """Ten seconds are twenty values of half a second each, of which the newest four wait."""
+    h = new_history(CohesionSettings(), 0.1)
+    for k in range(60):
+        h.push(observe(0.1 * k, {"a": (2.0 * k, 0.5 * (k // 5 % 2), 20.0)}))
+    (track,) = h.in_sight()
+    changed = [i for i in range(1, 55) if track.habits[i] is not track.habits[i - 1]]
+    # The first transition that counts ends in step 5; the fourth after it makes it an old one.
+    assert track.steps[changed[0]] == 5 + 4 * 5
+    assert h._habit()._window == 20
+
+
 TURN = Agreement("position", 3, (1.0, 2.5, 0.5, 2.5, 1.0), (0.0,) * 5, (400.0,) * 5)
 STRAIGHT = Agreement("road", 4, (0.0, 2.5, 0.0, 2.5, 0.0), (0.0,) * 5, (400.0,) * 5)
 SPEED_ONLY = (0.0, 400.0, 0.0, 400.0, 0.0)
@@ -297,6 +397,14 @@ def test_the_threshold_is_the_setting_where_that_is_lower() -> None:
             group = TURN._replace(weight=(surprise, 400.0, 0.0, 400.0, 0.0))
             (elected,), _ = election.elect((group,), NOWHERE, time)
             assert (elected.weight == group.weight) is news, (time, surprise)
+
+
+def test_what_is_as_much_as_the_threshold_is_no_surprise_yet() -> None:
+    just = TURN._replace(weight=(5.0, 400.0, 0.0, 400.0, 0.0))
+    election = Election(SETTINGS)
+    for time in (0.0, 0.1):  # nor is it remembered as one
+        (elected,), _ = election.elect((just,), NOWHERE, time)
+        assert elected.weight == SPEED_ONLY
 
 
 def test_only_a_surprise_prolongs_the_attention() -> None:
@@ -412,6 +520,27 @@ def test_who_hardly_moves_has_hardly_a_direction() -> None:
     psi = social_features((0, 0, 0, 0), (0.03, 0.04, 0, 0), 0.5)
     assert psi[4] * DECLARED[4].scale == pytest.approx(0.04 / (0.05 * 2**0.5))
     assert psi[3] * DECLARED[3].scale == pytest.approx(0.05 * 2**0.5 / 0.5)
+
+
+def test_where_too_few_were_seen_nothing_is_asked_and_farther_on_again(highway: Road) -> None:
+    # In 5 s the ego is where neither is known to have been.
+    h = come_along(0.0, {"a": (250.0, 3.6, 25.0, 0.0), "b": (245.0, 3.4, 25.0, 0.0)}, 40)
+    ego = RoadState(262.0, 0.5, 0.0, 25.0)
+    settings = SETTINGS.model_copy(update={"position_width": 4.0})
+    place = agree_on_place(ego, h, highway, [0.1, 5.0, 0.2], settings)
+    assert place.n == 2
+    mean, spread = 3.5, 0.02 / 3.5**2
+    assert place.mean == pytest.approx((mean, 0.5, mean))
+    assert place.variance == pytest.approx((spread, 0.0, spread))
+    weight = 1.0 / (spread + 2.5e-3)
+    assert place.weight == pytest.approx((weight, 0.0, weight))
+    assert place.surprise == pytest.approx(weight * (3.0 / 3.5) ** 2)  # 3 m from the ego
+
+
+def test_a_place_between_lanes_surprises_by_its_way_to_the_nearest(highway: Road) -> None:
+    h = come_along(5.0, {c: (s, 5.0, 25.0, 0.0) for c, s in (("a", 270.0), ("b", 250.0))})
+    place = agree_on_place(RoadState(297.5, 5.0, 0.0, 25.0), h, highway, [0.1], SETTINGS)
+    assert place.surprise == pytest.approx(400.0 * (1.5 / 3.5) ** 2)  # lanes are at 3.5 and 7
 
 
 def test_combined_term_differs_from_the_groups_sum_by_a_constant() -> None:
