@@ -159,7 +159,8 @@ class Plan:
 
     Attributes
     ----------
-    controls : the T planned controls; the first is driven. Empty: SUMO drives the ego.
+    controls : the T planned controls; the first is driven. Empty, with the status "sumo":
+        SUMO drives the ego.
     states : (T + 1, 4) predicted road states, the present one first.
     status : "solved", RESCUED, "sumo", or why the plan is a fallback.
     solver : which one, and whether it is compiled; empty for planners without.

@@ -18,6 +18,7 @@ from sumo_cohesion.tables.columns import describe_tables
 from tests.conftest import ROOT
 
 README = (ROOT / "README.md").read_text(encoding="utf-8")
+LOCK = (ROOT / "requirements.lock").read_text(encoding="utf-8")
 
 
 def blocks(text: str, language: str) -> list[str]:
@@ -65,6 +66,36 @@ def test_links_exist() -> None:
             assert (page.parent / target).exists(), target
 
 
+def test_what_an_index_shows_has_no_links_into_the_repository() -> None:
+    about = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    page = (ROOT / about["readme"]).read_text(encoding="utf-8")
+    assert not re.findall(r"\]\((?!http)", page)
+    assert about["authors"]
+    assert "pip install sumo-cohesion" not in README  # before there is one to install
+
+
+def test_the_lock_keeps_what_is_declared() -> None:
+    about = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    locked = dict(re.findall(r"^([\w.-]+)==([\w.]+)", LOCK, flags=re.MULTILINE))
+    for name, least in re.findall(r"([\w-]+)>=([\d.]+)", " ".join(about["dependencies"])):
+        assert numbers(locked[name]) >= numbers(least), name
+
+
+def numbers(version: str) -> list[int]:
+    return [int(part) for part in version.split(".") if part.isdigit()]
+
+
+def test_no_shell_reads_brackets_that_are_not_quoted() -> None:
+    pages = [ROOT / "README.md", *(ROOT / "docs").glob("*.md")]
+    for text in (page.read_text(encoding="utf-8") for page in pages):
+        spans = re.findall(r"`([^`\n]+)`", text)
+        lines = [line for block in blocks(text, "sh") for line in block.splitlines()]
+        for command in (*spans, *lines):
+            if command.startswith(("sumo-cohesion ", "pip ", "--")):
+                bare = re.sub(r"'[^']*'|\"[^\"]*\"|#.*", "", command)
+                assert not set("[](){}*?") & set(bare), command
+
+
 def test_tables_page_matches_the_code() -> None:
     page = (ROOT / "docs" / "tables.md").read_text(encoding="utf-8")
     assert page == describe_tables(), "run: make docs"
@@ -102,7 +133,7 @@ def test_batches_page_shows_every_key_and_its_code_runs(
     short = short.replace("[0.03, 0.09, 0.27]", "[0.03, 0.09]")
     (tmp_path / "beta.toml").write_text(short)
     commands = [line for block in blocks(page, "sh") for line in block.splitlines()]
-    assert len(commands) == 5
+    assert len(commands) == 6
     for command in commands:
         monkeypatch.setattr(sys, "argv", shlex.split(command, comments=True))
         cli.main()

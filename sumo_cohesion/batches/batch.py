@@ -218,7 +218,7 @@ def _dask_engine(address: str, count: int, limits: Limits) -> Iterator[_Engine]:
     try:
         from distributed import Client, LocalCluster
     except ImportError:
-        raise UserError("--dask needs Dask; pip install 'sumo-cohesion[cluster]'") from None
+        raise UserError("--dask needs Dask; pip install distributed") from None
     if address == "local":
         with (
             LocalCluster(n_workers=count, threads_per_worker=1, dashboard_address=None) as cluster,

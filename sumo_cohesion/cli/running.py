@@ -29,7 +29,7 @@ SUMO_OUTPUTS = get_args(Output)
 @click.option("--seed", type=int, default=0, show_default=True, help="Varies the traffic.")
 @options.changes
 @click.option("--out", type=click.Path(path_type=Path), help="Folder for the run's tables.")
-@click.option("--gui", is_flag=True, help="Show SUMO's window (needs 'sumo-cohesion[gui]').")
+@click.option("--gui", is_flag=True, help="Show SUMO's window (needs eclipse-sumo).")
 @click.option(
     "--sumo-outputs",
     metavar="KINDS",

@@ -112,7 +112,7 @@ def parse_planner(name: str) -> OwnPlanner:
     UserError
         If it is not of this form; arguments are Python literals by name.
     """
-    found = re.fullmatch(r"([^:()]+\.py|[\w.]+):(\w+)(\(.*\))?", name)
+    found = re.fullmatch(r"([^:()\0]+\.py|[\w.]+):(\w+)(\(.*\))?", name)
     if found is None:
         raise UserError(f"unknown planner {name!r}{_meant(name)}")
     module, class_name, arguments = found.groups()
@@ -136,7 +136,7 @@ def _meant(name: str) -> str:
     """Suggest planners for a name that is none."""
     words = re.split(r"[\s;,]+", name)
     if len(words) > 1 and all(word in BUILT_IN or ":" in word for word in words):
-        return "; that is several: separate them by commas, where several can be given"
+        return "; that is several: compare and batch take several, separated by commas"
     if close := difflib.get_close_matches(name, BUILT_IN, 1):
         return f"; did you mean {close[0]!r}?"
     file = Path(name if name.endswith(".py") else f"{name}.py")

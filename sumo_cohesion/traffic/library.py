@@ -98,7 +98,7 @@ def load_window() -> tuple[Any, str]:
         "sumo-gui", path=str(Path(sys.executable).parent)
     )
     if program is None:
-        raise UserError("--gui needs sumo-gui; pip install 'sumo-cohesion[gui]'")
+        raise UserError("--gui needs sumo-gui; pip install eclipse-sumo")
     load_libsumo()
     import traci
 

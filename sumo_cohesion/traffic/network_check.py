@@ -25,7 +25,7 @@ _LIGHTS = frozenset("rRyYgGsuoO")
 """Letters of a traffic light's states."""
 
 
-class _Nonsense(Exception):
+class _NonsenseError(Exception):
     """What is wrong, and where: the message is half a line."""
 
 
@@ -58,7 +58,7 @@ def check_network(net: ET.Element, path: Path) -> None:
         edges = _checked_edges(net)
         _check_junctions(net, edges)
         _check_connections(net, edges, _checked_lights(net))
-    except _Nonsense as error:
+    except _NonsenseError as error:
         raise UserError(f"{path}: {error}; rebuild the network with netconvert") from None
 
 
@@ -68,11 +68,11 @@ def _checked_edges(net: ET.Element) -> _Edges:
         name = _new_id(edge, edges.n_lanes)
         lanes = edge.findall("lane")
         if not lanes:
-            raise _Nonsense(f"edge {name!r} has no lanes")
+            raise _NonsenseError(f"edge {name!r} has no lanes")
         for index, lane in enumerate(lanes):
             lane_name = _new_id(lane, edges.lanes)
             if lane_name != f"{name}_{index}":
-                raise _Nonsense(f"lane {index} of edge {name!r} is called {lane_name!r}")
+                raise _NonsenseError(f"lane {index} of edge {name!r} is called {lane_name!r}")
             _check_lane(lane, lane_name)
             edges.lanes[lane_name] = _Lane(name, edge.get("function") == "internal")
         edges.n_lanes[name] = len(lanes)
@@ -85,7 +85,9 @@ def _checked_edges(net: ET.Element) -> _Edges:
 def _check_indices(edge: str, lanes: list[ET.Element]) -> None:
     for index, lane in enumerate(lanes):
         if lane.get("index") != str(index):
-            raise _Nonsense(f"lane {index} of edge {edge!r} has the index {lane.get('index')!r}")
+            raise _NonsenseError(
+                f"lane {index} of edge {edge!r} has the index {lane.get('index')!r}"
+            )
 
 
 def _check_lane(lane: ET.Element, name: str) -> None:
@@ -94,13 +96,13 @@ def _check_lane(lane: ET.Element, name: str) -> None:
     _check_number(of, "speed", _need(lane, "speed"), FASTEST)
     _check_number(of, "width", lane.get("width", "1"), WIDEST)
     if _check_shape(of, _need(lane, "shape")) < 2:
-        raise _Nonsense(f"{of}: its shape has fewer than two points")
+        raise _NonsenseError(f"{of}: its shape has fewer than two points")
 
 
 def _check_number(of: str, key: str, text: str, most: float) -> None:
     """Check what must be more than nothing, and no more than ``most``."""
     if not 0.0 < _number(of, key, text) <= most:
-        raise _Nonsense(f"{of}: {key} = {text!r} is not between 0 and {most:g}")
+        raise _NonsenseError(f"{of}: {key} = {text!r} is not between 0 and {most:g}")
 
 
 def _number(of: str, key: str, text: str) -> float:
@@ -109,7 +111,7 @@ def _number(of: str, key: str, text: str) -> float:
     except ValueError:
         value = inf
     if not isfinite(value):
-        raise _Nonsense(f"{of}: {key} = {text[:40]!r} is not a finite number")
+        raise _NonsenseError(f"{of}: {key} = {text[:40]!r} is not a finite number")
     return value
 
 
@@ -118,14 +120,14 @@ def _check_shape(of: str, text: str) -> int:
     points = text.split()
     for point in points:
         if point.count(",") not in (1, 2):
-            raise _Nonsense(f"{of}: {point[:40]!r} in its shape is not a point x,y")
+            raise _NonsenseError(f"{of}: {point[:40]!r} in its shape is not a point x,y")
     try:
         # All numbers at once: networks have millions.
         values = [float(part) for part in ",".join(points).split(",")] if points else []
     except ValueError:
-        raise _Nonsense(f"{of}: its shape is not a list of points x,y") from None
+        raise _NonsenseError(f"{of}: its shape is not a list of points x,y") from None
     if not (isfinite(sum(values)) and max(map(abs, values), default=0.0) < FARTHEST):
-        raise _Nonsense(f"{of}: its shape goes farther than {FARTHEST:g} m")
+        raise _NonsenseError(f"{of}: its shape goes farther than {FARTHEST:g} m")
     return len(points)
 
 
@@ -137,17 +139,17 @@ def _check_junctions(net: ET.Element, edges: _Edges) -> None:
         of = f"junction {name!r}"
         for key in ("x", "y"):
             if abs(_number(of, key, _need(junction, key))) >= FARTHEST:
-                raise _Nonsense(f"{of}: {key} is farther than {FARTHEST:g} m")
+                raise _NonsenseError(f"{of}: {key} is farther than {FARTHEST:g} m")
         _check_shape(of, junction.get("shape", ""))
         for key in ("incLanes", "intLanes"):
             for lane in junction.get(key, "").split():
                 if lane not in edges.lanes:
-                    raise _Nonsense(f"{of}: {key} names lane {lane!r}, which is not there")
+                    raise _NonsenseError(f"{of}: {key} names lane {lane!r}, which is not there")
         _check_requests(of, junction.findall("request"))
     for ends in (edges.start, edges.end):
         for edge, junction_name in ends.items():
             if junction_name not in names:
-                raise _Nonsense(
+                raise _NonsenseError(
                     f"edge {edge!r} names junction {junction_name!r}, which is not there"
                 )
 
@@ -156,11 +158,11 @@ def _check_requests(of: str, requests: list[ET.Element]) -> None:
     """Check a junction's right of way: of each of its links, which others it waits for."""
     for index, request in enumerate(requests):
         if request.get("index") != str(index):
-            raise _Nonsense(f"{of}: request {index} has the index {request.get('index')!r}")
+            raise _NonsenseError(f"{of}: request {index} has the index {request.get('index')!r}")
         for key in ("response", "foes"):
             text = _need(request, key)
             if len(text) != len(requests) or not set(text) <= {"0", "1"}:
-                raise _Nonsense(
+                raise _NonsenseError(
                     f"{of}: {key} = {text[:40]!r} of request {index} is not a 0 or 1 for each of "
                     f"its {len(requests)} links"
                 )
@@ -175,16 +177,16 @@ def _checked_lights(net: ET.Element) -> dict[str, int]:
         of = f"traffic light {name!r}"
         program = (name, _need(logic, "programID"))
         if program in programs:
-            raise _Nonsense(f"{of} has the program {program[1]!r} twice")
+            raise _NonsenseError(f"{of} has the program {program[1]!r} twice")
         programs.add(program)
         _number(of, "offset", logic.get("offset", "0"))
         phases = logic.findall("phase")
         if not phases:
-            raise _Nonsense(f"{of}: its program has no phases")
+            raise _NonsenseError(f"{of}: its program has no phases")
         for phase in phases:
             state = _need(phase, "state")
             if len(state) != links.setdefault(name, len(state)) or not set(state) <= _LIGHTS:
-                raise _Nonsense(
+                raise _NonsenseError(
                     f"{of}: the state {state[:40]!r} of a phase is not a letter for each of its "
                     f"{links[name]} links"
                 )
@@ -202,16 +204,16 @@ def _check_connections(net: ET.Element, edges: _Edges, lights: dict[str, int]) -
         via = connection.get("via")
         if via:
             if via not in edges.lanes or not via.startswith(":"):
-                raise _Nonsense(
+                raise _NonsenseError(
                     f"{_called(connection)} leads by lane {via!r}, which is not one within a "
                     "junction"
                 )
             if via in entered and edges.lanes[via].internal:
-                raise _Nonsense(f"two connections lead by lane {via!r}")
+                raise _NonsenseError(f"two connections lead by lane {via!r}")
             entered.add(via)
         if start.internal:
             if first in onward:
-                raise _Nonsense(f"two connections lead on from lane {first!r}")
+                raise _NonsenseError(f"two connections lead on from lane {first!r}")
             onward[first] = connection
         elif via:
             ordinary.append(connection)
@@ -221,7 +223,7 @@ def _check_connections(net: ET.Element, edges: _Edges, lights: dict[str, int]) -
     for name, lane in edges.lanes.items():
         if lane.internal and (name not in entered or name not in onward):
             how = "into" if name not in entered else "on from"
-            raise _Nonsense(f"no connection leads {how} lane {name!r} within a junction")
+            raise _NonsenseError(f"no connection leads {how} lane {name!r} within a junction")
     for connection in ordinary:
         _check_way(connection, onward)
 
@@ -233,9 +235,9 @@ def _check_ends(connection: ET.Element, edges: _Edges) -> list[str]:
         edge, index = _need(connection, key), _need(connection, lane_key)
         n = edges.n_lanes.get(edge)
         if n is None:
-            raise _Nonsense(f"{_called(connection)} names edge {edge!r}, which is not there")
+            raise _NonsenseError(f"{_called(connection)} names edge {edge!r}, which is not there")
         if f"{edge}_{index}" not in edges.lanes or edges.lanes[f"{edge}_{index}"].edge != edge:
-            raise _Nonsense(
+            raise _NonsenseError(
                 f"{_called(connection)}: {lane_key} = {index!r}, but edge {edge!r} has lanes 0 to "
                 f"{n - 1}"
             )
@@ -245,15 +247,16 @@ def _check_ends(connection: ET.Element, edges: _Edges) -> list[str]:
         edges.start.get(connection.get("to", "")),
     }
     if len(junctions - {None}) > 1:
-        raise _Nonsense(f"{_called(connection)}: the one does not end where the other begins")
+        raise _NonsenseError(f"{_called(connection)}: the one does not end where the other begins")
     return ends
 
 
 def _check_link(connection: ET.Element, n: int) -> None:
     index = _need(connection, "linkIndex")
     if not (index.isdecimal() and int(index) < n):
-        raise _Nonsense(
-            f"{_called(connection)}: linkIndex = {index[:40]!r}, but its traffic light has {n} links"
+        raise _NonsenseError(
+            f"{_called(connection)}: linkIndex = {index[:40]!r}, but its traffic light has {n} "
+            "links"
         )
 
 
@@ -262,10 +265,10 @@ def _check_way(connection: ET.Element, onward: dict[str, ET.Element]) -> None:
     last, passed = connection, 0
     while via := last.get("via"):
         if via not in onward or passed > 10:
-            raise _Nonsense(f"{_called(connection)} leads into a junction and not out of it")
+            raise _NonsenseError(f"{_called(connection)} leads into a junction and not out of it")
         last, passed = onward[via], passed + 1
     if any(last.get(key) != connection.get(key) for key in ("to", "toLane")):
-        raise _Nonsense(
+        raise _NonsenseError(
             f"{_called(connection)} leads by {connection.get('via')!r}, which ends on another lane"
         )
 
@@ -280,12 +283,12 @@ def _need(element: ET.Element, key: str) -> str:
     if not text:
         name = element.get("id")
         of = f"<{element.tag}>" if name is None else f"{element.tag} {name!r}"
-        raise _Nonsense(f"{of} has no {key}")
+        raise _NonsenseError(f"{of} has no {key}")
     return text
 
 
 def _new_id(element: ET.Element, known: Collection[str]) -> str:
     name = _need(element, "id")
     if name in known:
-        raise _Nonsense(f"{element.tag} {name!r} is there twice")
+        raise _NonsenseError(f"{element.tag} {name!r} is there twice")
     return name
