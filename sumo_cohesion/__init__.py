@@ -14,9 +14,12 @@ if TYPE_CHECKING:
     from sumo_cohesion.batches.results import load_metrics, load_rollout, load_trajectories
     from sumo_cohesion.errors import SimulationError, UserError
     from sumo_cohesion.planning.planners import Planner
+    from sumo_cohesion.simulation.episode import Episode
     from sumo_cohesion.simulation.export import export_scenario
+    from sumo_cohesion.simulation.request import RunRequest
     from sumo_cohesion.simulation.run import run
     from sumo_cohesion.simulation.scenario import load_scenario
+    from sumo_cohesion.simulation.setup import prepare
     from sumo_cohesion.state import Control, Observation, Plan, RoadState
     from sumo_cohesion.tables.paired import compare_planners
     from sumo_cohesion.tables.rollout import Rollout
@@ -24,11 +27,13 @@ if TYPE_CHECKING:
 _HOME = {
     "Comparison": "batches.comparison",
     "Control": "state",
+    "Episode": "simulation.episode",
     "Observation": "state",
     "Plan": "state",
     "Planner": "planning.planners",
     "RoadState": "state",
     "Rollout": "tables.rollout",
+    "RunRequest": "simulation.request",
     "SimulationError": "errors",
     "UserError": "errors",
     "batch": "batches.batch",
@@ -39,17 +44,20 @@ _HOME = {
     "load_rollout": "batches.results",
     "load_scenario": "simulation.scenario",
     "load_trajectories": "batches.results",
+    "prepare": "simulation.setup",
     "run": "simulation.run",
 }
 
 __all__ = [
     "Comparison",
     "Control",
+    "Episode",
     "Observation",
     "Plan",
     "Planner",
     "RoadState",
     "Rollout",
+    "RunRequest",
     "SimulationError",
     "UserError",
     "batch",
@@ -60,6 +68,7 @@ __all__ = [
     "load_rollout",
     "load_scenario",
     "load_trajectories",
+    "prepare",
     "run",
 ]
 

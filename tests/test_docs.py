@@ -28,9 +28,10 @@ def blocks(text: str, language: str) -> list[str]:
 @pytest.mark.slow
 def test_readme_python_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    first, planner = blocks(README, "python")
-    exec(compile(first, "README.md", "exec"), {"__name__": "readme"})
-    (tmp_path / "straight.py").write_text(planner)
+    names: dict[str, object] = {"__name__": "readme"}
+    for block in blocks(README, "python"):  # one after the other, as in a notebook
+        exec(compile(block, "README.md", "exec"), names)
+    assert names["episode"].outcome == "collision"  # type: ignore[attr-defined]
 
 
 @pytest.mark.slow

@@ -103,6 +103,17 @@ class Experiment(BaseModel):
     def _as_list(cls, value: Any) -> Any:
         return seeds_of(value)
 
+    @field_validator("planners", mode="before")
+    @classmethod
+    def _by_name(cls, value: Any) -> Any:
+        for planner in value if isinstance(value, list | tuple) else ():
+            if not isinstance(planner, str):
+                raise ValueError(
+                    f"{planner!r} cannot leave this process, and a batch runs in others; put the "
+                    "planner into a file and name it as file.py:Class"
+                )
+        return value
+
     @field_validator("scenarios", "planners", "seeds", "keep", "sumo_outputs")
     @classmethod
     def _no_repeats(cls, value: tuple[Any, ...]) -> tuple[Any, ...]:

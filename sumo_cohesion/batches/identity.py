@@ -88,9 +88,14 @@ def code_of_a_run() -> dict[str, Path]:
     return found
 
 
-@lru_cache(maxsize=256)
 def _compiled(path: Path) -> list[CodeType]:
     """Compile a module and whatever is defined in it; without docstrings and assertions."""
+    stat = path.stat()
+    return _compiled_once(path, stat.st_mtime_ns, stat.st_size)
+
+
+@lru_cache(maxsize=256)
+def _compiled_once(path: Path, _changed: int, _size: int) -> list[CodeType]:
     found = [compile(path.read_bytes(), path.name, "exec", dont_inherit=True, optimize=2)]
     for code in found:
         found += [value for value in code.co_consts if isinstance(value, CodeType)]
