@@ -68,6 +68,13 @@ def test_jerk_and_lateral_acceleration() -> None:
     assert metrics.max_jerk(ego) == pytest.approx(3.0)
     ego["speed"], ego["heading"] = 20.0, 0.1 * TIME  # yaw rate 0.1 rad/s
     assert metrics.max_lateral_acceleration(ego) == pytest.approx(2.0)
+    # Nor when it began, nor where it was heading, nor to which side.
+    ego["time"], ego["heading"] = TIME + 7.0, np.pi - 0.1 * TIME
+    ego["heading"] = (ego["heading"] + np.pi) % (2 * np.pi) - np.pi
+    ego["speed"] = 10.0 - 0.5 * 3.0 * TIME**2
+    assert metrics.max_jerk(ego) == pytest.approx(3.0)
+    assert metrics.max_lateral_acceleration(ego.assign(speed=20.0)) == pytest.approx(2.0)
+    assert metrics.max_jerk(ego[:2]) == 0.0  # two states have one acceleration
 
 
 def test_hard_brakes_count_onsets_not_steps_and_no_gaps() -> None:
@@ -108,6 +115,16 @@ def test_off_road_is_when_the_side_crosses_the_edge() -> None:
     plan = pd.DataFrame({"road_right": np.full(51, -1.75), "road_left": np.full(51, 8.75)})
     assert not metrics.off_road(car("ego", TIME, d=-0.84), plan)
     assert metrics.off_road(car("ego", TIME, d=-0.86), plan)
+    assert not metrics.off_road(car("ego", TIME, d=7.84), plan)
+    assert metrics.off_road(car("ego", TIME, d=7.86), plan)
+    # On the edge is on the road; and once is enough.
+    exact = pd.DataFrame({"road_right": np.full(51, -0.5), "road_left": np.full(51, 0.5)})
+    ego = car("ego", TIME).assign(width=1.0)
+    assert not metrics.off_road(ego, exact)
+    ego.loc[30, "d"] = 0.01
+    assert metrics.off_road(ego, exact)
+    # The last row has no plan any more.
+    assert not metrics.off_road(ego[:31], exact[:30])
 
 
 @pytest.mark.parametrize(
@@ -119,6 +136,9 @@ def test_off_road_is_when_the_side_crosses_the_edge() -> None:
         ({"distance": {"min": None, "max": 600}}, False),
         ({"min_ttc": {"min": 1.0}}, False),  # undefined is no success
         ({"collision": False, "distance": {"min": 700}}, False),
+        ({"distance": {"min": 650.0}}, True),  # both ends belong to it
+        ({"distance": {"max": 650.0}}, True),
+        ({}, True),
     ],
 )
 def test_success_conditions(conditions: dict[str, object], expected: bool) -> None:

@@ -56,6 +56,7 @@ def track_of(h: History, name: str = "a") -> Track:
 
 def test_a_transition_is_remembered_for_the_memory_and_no_longer() -> None:
     h = history(memory=2.0)
+    assert list(h.in_sight()) == []
     follow(h, range(60))
     # The newest ended in step 59; those of the last twenty steps are there, and that one.
     assert track_of(h).steps == list(range(39, 60))
@@ -76,8 +77,8 @@ def test_who_is_gone_is_forgotten_with_its_last_transition() -> None:
     # Without any transition: as long after it was seen.
     follow(h, range(2), "b")
     for k in range(20):
-        assert "b" in h._tracks, k
         h.push(observe(4.0 + 0.1 * k, {}))
+        assert "b" in h._tracks, k
     h.push(observe(9.0, {}))
     assert h._tracks == {}
 
@@ -199,8 +200,10 @@ def test_the_egos_path_is_bounded_and_never_goes_back() -> None:
     places = ((-1.0, 0.0), (0.0, 0.0), (0.5, 1.0), (2.0, 1.0), (2.1, 2.0), (99.0, 2.0))
     for s, d in places:  # the known place nearest ahead
         assert path.at(s) == d, s
-    for k in range(3, 7):
+    for k in range(3, 6):
         path.add(2.0 * k, float(k))
+    assert path.first == 0.0
+    path.add(12.0, 6.0)
     # Six are kept; the seventh drops the three oldest.
     assert path.first == 6.0
     assert path.at(0.0) == 3.0

@@ -56,6 +56,8 @@ def test_deviation_counts_common_times_only() -> None:
     one = pd.DataFrame({"time": [0.0, 0.1, 0.2], "d": [0.0, 1.0, 9.0], "speed": [5.0, 5.0, 5.0]})
     other = pd.DataFrame({"time": [0.0, 0.1], "d": [0.5, 0.0], "speed": [5.0, 7.0]})
     assert metrics.deviation(one, other) == pytest.approx((1.0, 2.0))
+    assert metrics.deviation(one, one) == (0.0, 0.0)
+    assert metrics.deviation(one, other[:1] - 0.5) == pytest.approx((np.nan, np.nan), nan_ok=True)
 
 
 def test_speed_is_most_agreed_where_both_its_features_lead() -> None:
