@@ -29,14 +29,16 @@ def drive(
     scenario: str,
     planner: str,
     seed: int,
-    overrides: dict[str, Any],
+    changes: Sequence[str],
     out: Path | None,
     sumo_outputs: Sequence[Output] = (),
     gui: bool = False,
 ) -> Driven:
-    """Drive one scenario once, as simulation.run.run does."""
+    """Drive one scenario once, as simulation.run.run does; ``changes`` are written NAME=VALUE."""
     from sumo_cohesion.simulation.run import run
+    from sumo_cohesion.simulation.scenario import parse_overrides
 
+    overrides = parse_overrides(changes)
     rollout = run(
         scenario, planner, seed, overrides=overrides, out=out, sumo_outputs=sumo_outputs, gui=gui
     )

@@ -48,10 +48,6 @@ workers = click.option(
 
 def parsed_overrides(given: Sequence[str]) -> dict[str, Any]:
     """Return settings by dotted name, from the values of --set."""
-    if not given:
-        return {}
-    from sumo_cohesion.simulation.scenario import Scenario
-    from sumo_cohesion.user_input import parse_override, text_settings
+    from sumo_cohesion.simulation.scenario import parse_overrides
 
-    texts = text_settings(Scenario)
-    return dict(parse_override(text, texts) for text in given)
+    return parse_overrides(given)

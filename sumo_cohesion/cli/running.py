@@ -6,7 +6,7 @@ import json
 import signal
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Literal, get_args
 
 import click
 
@@ -53,7 +53,7 @@ def run(
         scenario,
         planner,
         seed,
-        options.parsed_overrides(changes),
+        changes,
         out,
         _sumo_outputs(sumo_outputs, out),
         gui=gui,
@@ -73,7 +73,7 @@ def _drive(
     scenario: str,
     planner: str,
     seed: int,
-    overrides: dict[str, Any],
+    changes: Sequence[str],
     out: Path | None,
     sumo_outputs: Sequence[Output],
     *,
@@ -88,9 +88,9 @@ def _drive(
 
     if gui:
         with clean_stdout():
-            return drive(scenario, planner, seed, overrides, out, sumo_outputs, gui=True)
+            return drive(scenario, planner, seed, changes, out, sumo_outputs, gui=True)
     try:
-        driven: Driven = call_apart(TASK, scenario, planner, seed, overrides, out, sumo_outputs)
+        driven: Driven = call_apart(TASK, scenario, planner, seed, changes, out, sumo_outputs)
     except CallFailedError as error:
         raise _lost(error, scenario, planner) from None
     return driven

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any
@@ -16,9 +16,11 @@ from sumo_cohesion.traffic.drivers import Event
 from sumo_cohesion.user_input import (
     closest,
     merge,
+    parse_override,
     read_toml,
     refuse_other_kind,
     refuse_sumo_file,
+    text_settings,
     validated,
 )
 
@@ -170,3 +172,9 @@ def load_scenario(source: str | Path, overrides: Mapping[str, Any] | None = None
     scenario = validated(Scenario, merge(data, overrides or {}), str(path))
     scenario._folder = path.parent.resolve()
     return scenario
+
+
+def parse_overrides(changes: Sequence[str]) -> dict[str, Any]:
+    """Return settings by dotted name, of what is written as NAME=VALUE."""
+    texts = text_settings(Scenario)
+    return dict(parse_override(text, texts) for text in changes)

@@ -169,7 +169,6 @@ def test_mistakes_in_an_experiment_name_its_file(
     assert_one_line(invoke("batch", "mine.toml"), "mine.toml: ", *needles)
 
 
-@pytest.mark.xfail(strict=True, reason="scenario.py and demand.py still load pandas and SciPy")
 def test_listing_scenarios_is_light() -> None:
     assert not heavy_after("scenarios")
 

@@ -93,7 +93,7 @@ def test_seeds_are_read_alike_however_given(seeds: Any, monkeypatch: pytest.Monk
     asked: list[int] = []
 
     def stop(jobs: Any, *_: object) -> None:
-        asked.extend(job.seed for job in jobs)
+        asked.extend(job.request.seed for job in jobs)
         raise sc.UserError("enough")
 
     monkeypatch.setattr(comparison, "_run_all", stop)

@@ -61,7 +61,7 @@ def test_the_command_itself_loads_nothing_that_can_crash(tmp_path: Path) -> None
     [
         ("SegmentationFault", 2, ["SIGSEGV", "SegmentationFault", "--planner nominal"]),
         ("Exits", 2, ["exit status 3", "Exits", "--planner nominal"]),
-        ("RaisesAtOnce", 1, ["no such road"]),
+        ("RaisesAtOnce", 2, ["no such road", "--traceback"]),
     ],
 )
 def test_a_planner_that_ends_its_process_is_one_line(

@@ -10,7 +10,7 @@ import pytest
 
 from sumo_cohesion.perception.habit import Habit
 from sumo_cohesion.perception.history import History, Path, State, Track
-from sumo_cohesion.perception.observation import Overview, Sensor
+from sumo_cohesion.perception.observation import Sensor
 from sumo_cohesion.road import Road
 from sumo_cohesion.state import CartesianState, Observation, RoadState, Scene
 
@@ -268,8 +268,8 @@ def test_what_is_in_range_and_not_hidden_is_seen_in_the_roads_frame(highway: Roa
         (310.0, -5.25, pi - 0.1, 10.0),
         (290.0, -1.75, 0.2, 30.0),
     )
-    sensor = Sensor(highway, 50.0, hidden={"c3"}, special={"c4"})
-    found = sensor.observe(seen, not_followed={"c1"})
+    sensor = Sensor(50.0, hidden={"c3"}, special={"c4"})
+    found = sensor.survey(seen, highway, not_followed={"c1"}).seen_by("ego")
     assert found.ids == ("c0", "c1", "c4")
     assert found.voter == (True, False, False)
     assert found.ego == pytest.approx((300.0, 0.0, 0.1, 25.0))
@@ -278,7 +278,8 @@ def test_what_is_in_range_and_not_hidden_is_seen_in_the_roads_frame(highway: Roa
     assert found.states == pytest.approx(np.array(expected))
     assert found.sizes[:, 0].tolist() == [4.0, 5.0, 8.0]
     assert found.curvature.tolist() == [0.0, 0.0, 0.0]
-    assert Sensor(highway, 50.0).observe(scene()).states.shape == (0, 4)
+    alone = Sensor(50.0).survey(scene(), highway).seen_by("ego")
+    assert alone.states.shape == (0, 4)
 
 
 def test_headings_are_relative_to_the_road_and_wrapped(curve: Road) -> None:
@@ -293,24 +294,27 @@ def test_headings_are_relative_to_the_road_and_wrapped(curve: Road) -> None:
         states=np.array([[*there, angle + pi + 0.3, 20.0]]),
         sizes=np.array([[5.0, 1.8]]),
     )
-    found = Sensor(curve, 50.0).observe(world)
+    found = Sensor(50.0).survey(world, curve).seen_by("ego")
     assert found.ego.heading == pytest.approx(0.2, abs=0.01)
     assert found.states[0, 2] == pytest.approx(0.3 - pi, abs=0.01)
     assert found.curvature[0] == pytest.approx(1 / 505.25, rel=0.05)
 
 
 def test_nobody_sees_itself_nor_beyond_its_reach(highway: Road) -> None:
-    states = np.array([[300.0, -8.75, 0.0, 20.0], [330.0, -8.75 + 40.0, 0.0, 20.0],
-                       [251.0, -8.75, 0.0, 20.0], [249.0, -8.75, 0.0, 20.0]])  # fmt: skip
-    sizes = np.column_stack((4.0 + np.arange(4), np.full(4, 2.0)))
-    voter = (True, False, True, True)
-    overview = Overview.along(highway, 4.0, ("a", "b", "c", "d"), states, sizes, voter)
-    found = overview.seen_by(0, 50.0)
-    assert found.ids == ("b", "c")
+    seen = scene(
+        (330.0, -8.75 + 40.0, 0.0, 20.0),
+        (251.0, -8.75, 0.0, 20.0),
+        (249.0, -8.75, 0.0, 20.0),
+    )
+    overview = Sensor(50.0, special={"c0"}).survey(seen, highway)
+    found = overview.seen_by("ego")
+    assert found.ids == ("c0", "c1")
     assert found.voter == (False, True)
-    assert found.ego == pytest.approx((300.0, 0.0, 0.0, 20.0))
-    assert (found.time, found.ego_size) == (4.0, (4.0, 2.0))
     assert found.states[0] == pytest.approx([330.0, 40.0, 0.0, 20.0])
-    assert found.sizes.tolist() == [[5.0, 2.0], [6.0, 2.0]]
+    assert found.sizes.tolist() == [[4.0, 2.0], [5.0, 2.0]]
     assert found.curvature.tolist() == [0.0, 0.0]
-    assert overview.seen_by(3, 2.0).ids == ("c",)
+    other = overview.seen_by("c1")
+    assert other.ids == ("c2", "ego")
+    assert other.ego == pytest.approx((251.0, 0.0, 0.0, 20.0))
+    assert (other.time, other.ego_size) == (4.0, (5.0, 2.0))
+    assert Sensor(2.0).survey(seen, highway).seen_by("c2").ids == ("c1",)

@@ -175,8 +175,9 @@ def remembered(cars: dict[str, list[tuple[float, float, float]]]) -> History:
     for k in range(steps):
         now = {n: rows[k - steps] for n, rows in cars.items() if steps - k <= len(rows)}
         seen = observe(0.1 * k, {n: (s, d, 20.0) for n, (s, d, _) in now.items()})
-        seen.states[:, 2] = [heading for *_, heading in now.values()]
-        h.push(seen)
+        states = seen.states.copy()
+        states[:, 2] = [heading for *_, heading in now.values()]
+        h.push(replace(seen, states=states))
     return h
 
 
