@@ -105,6 +105,23 @@ def test_a_crash_of_sumo_says_how_to_find_out(
     assert said.count("\n") == 1
 
 
+def test_a_crash_within_sumo_is_one_line(tmp_path: Path) -> None:
+    """SUMO takes a car out that is moved in the same step, and dies of it."""
+    (tmp_path / "k.add.xml").write_text(
+        '<additional><route id="r" edges="west east"/><calibrator id="k" edge="east" pos="0">'
+        '<flow begin="0" end="100" vehsPerHour="0" route="r" type="DEFAULT_VEHTYPE"/>'
+        "</calibrator></additional>"
+    )
+    text = (ROOT / "scenarios" / "nothing_to_follow.toml").read_text()
+    text = text.replace("duration =", 'additional = ["k.add.xml"]\nduration =')
+    (tmp_path / "mine.toml").write_text(text)
+    near = ("--set", "ego.position=950.0", "--set", "duration=5.0", "--planner", "nominal")
+    ended = done(command("run", str(tmp_path / "mine.toml"), *near))
+    assert ended.returncode == 2, ended.stderr
+    assert ended.stderr.startswith("error: ")
+    assert ended.stderr.count("\n") == 1
+
+
 def test_an_interrupt_ends_the_drive(tmp_path: Path) -> None:
     pid = tmp_path / "pid"
     name = f"{FAULTY}Tells(file={str(pid)!r})"
