@@ -63,10 +63,11 @@ def started(command: Sequence[str | Path], **options: Any) -> Iterator[subproces
     process = subprocess.Popen(
         command, text=True, stderr=subprocess.PIPE, start_new_session=True, **options
     )
-    try:
-        yield process
-    finally:
-        kill(process)
+    with process:  # closes its pipe
+        try:
+            yield process
+        finally:
+            kill(process)
 
 
 def kill(process: subprocess.Popen[str]) -> None:

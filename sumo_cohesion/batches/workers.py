@@ -317,7 +317,7 @@ class _Process:
         self._end_group()
         self._process.wait()
         for pipe in (self._to, self._from, self._said):
-            with contextlib.suppress(OSError):
+            with contextlib.suppress(OSError, ValueError):  # ValueError: closed by another thread
                 pipe.close()
         shutil.rmtree(self._folder, ignore_errors=True)
 

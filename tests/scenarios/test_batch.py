@@ -652,3 +652,22 @@ def test_threads_may_ask_for_runs_at_once_and_close_ends_them(tmp_path: Path) ->
     workers.close()
     wait_for(lambda: not any(thread.is_alive() for thread in threads), what="their end")
     assert ended == ["crash", "crash"]
+
+
+class ClosedMeanwhile:
+    """A pipe that another thread closes in the same moment."""
+
+    def close(self) -> None:
+        raise ValueError("flush of closed file")
+
+
+def test_a_process_is_ended_by_two_threads_at_once_without_a_word() -> None:
+    """By the one whose call it did, and by the one that closes the workers: after Ctrl-C."""
+    workers = Workers("builtins:len", Limits(3600.0, 1.0))
+    assert workers.call("four") == 4
+    (process,) = workers._all
+    with process._to:
+        process._process.stdin = ClosedMeanwhile()  # type: ignore[assignment]
+        workers.close()
+    assert not process.is_alive()
+    assert not Path(process._folder).exists()

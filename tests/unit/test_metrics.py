@@ -54,6 +54,50 @@ def test_cars_beside_behind_or_faster_are_no_threat() -> None:
     assert np.isnan(faster["min_ttc"])
 
 
+@pytest.mark.parametrize(
+    ("aside", "in_path"), [(0.0, True), (1.79, True), (1.81, False), (-1.79, True), (-1.81, False)]
+)
+def test_a_car_is_in_the_path_if_the_widths_overlap(aside: float, in_path: bool) -> None:
+    ego, other = car("ego", 20.0 * TIME, d=7.0), car("a", 60.0 + 10.0 * TIME, d=7.0 + aside)
+    assert np.isfinite(metrics.gap_metrics(ego, other)["min_gap"]) == in_path
+    assert np.isfinite(metrics.post_encroachment_time(ego, other)) == in_path
+
+
+def test_closing_in_is_along_the_road_and_however_slowly() -> None:
+    # 0.5 m/s at 60 degrees each: 0.25 m/s along the road, 0.9 m apart.
+    now = TIME[:1]
+    ego, lead = car("ego", now), car("lead", now + 5.9)
+    ego["speed"], ego["road_heading"] = 1.5, np.pi / 3
+    lead["speed"], lead["road_heading"] = 1.0, -np.pi / 3
+    result = metrics.gap_metrics(ego, lead)
+    assert result["min_ttc"] == pytest.approx(0.9 / 0.25)
+    assert result["max_drac"] == pytest.approx(0.25**2 / 1.8)
+    ego["speed"] = 1.0  # as fast as the car ahead: no time, and no braking
+    assert np.isnan(metrics.gap_metrics(ego, lead)["min_ttc"])
+    assert np.isnan(metrics.gap_metrics(ego, lead)["max_drac"])
+
+
+def test_at_contact_the_gap_is_nothing_and_the_rest_is_of_the_step_before() -> None:
+    ego, lead = car("ego", np.array([0.0, 2.0, 4.0])), car("lead", np.full(3, 8.0))
+    result = metrics.gap_metrics(ego, lead)
+    assert result["min_gap"] == 0.0
+    assert result["min_ttc"] == pytest.approx(1.0 / 20.0)
+
+
+def test_post_encroachment_of_several_is_the_least_and_counts_from_nothing() -> None:
+    ego = car("ego", 20.0 * TIME, d=3.5)
+    stands = car("stands", np.full(51, 30.0), d=3.5)
+    near, far = (car(n, gap + 5.0 + 20.0 * TIME, d=3.5) for n, gap in (("b", 10.0), ("a", 30.0)))
+    for others in ([stands, near, far], [far, near, stands]):
+        assert metrics.post_encroachment_time(ego, pd.concat(others)) == pytest.approx(0.5)
+    # However slowly it goes: 2 cm in a step, and the ego comes to where it has just been.
+    slow = car("slow", 60.0 + 0.2 * TIME, d=3.5)
+    fast = car("ego", 55.0 + 0.3 * TIME, d=3.5)
+    assert 0.0 <= metrics.post_encroachment_time(fast, slow) < 0.01
+    # Beyond where it was seen last nothing is known of it.
+    assert np.isnan(metrics.post_encroachment_time(car("ego", 200.0 + 20.0 * TIME, d=3.5), near))
+
+
 def test_post_encroachment_time_is_the_time_gap_behind_the_rear() -> None:
     # Both at 20 m/s, centres 45 m apart: the ego's front is 40 m behind the lead's rear: 2 s.
     ego = car("ego", 20.0 * TIME)
@@ -102,6 +146,22 @@ def test_who_comes_back_slower_into_sight_has_not_braked_hard() -> None:
     assert metrics.human_metrics(seen)["human_hard_brakes"] == 0
     # One step that is missing is a gap already.
     assert metrics.human_metrics(human.drop(index=20))["human_hard_brakes"] == 0
+
+
+def test_humans_are_counted_each_and_only_those_that_drive() -> None:
+    brakes = np.where(TIME < 2.0, 20.0, 15.0)
+    braking = [car(name, 20.0 * TIME).assign(speed=brakes) for name in ("b", "a")]
+    steady = car("c", 30.0 * TIME).assign(speed=30.0)
+    parked = car("d", 0.0 * TIME).assign(speed=0.1)
+    crawls = car("e", 0.0 * TIME).assign(speed=0.5)
+    result = metrics.human_metrics(pd.concat([*braking, steady, parked]))
+    assert result["human_hard_brakes"] == 2
+    assert result["human_mean_speed"] == pytest.approx((2 * brakes.mean() + 30.0) / 3)
+    assert metrics.human_metrics(crawls)["human_mean_speed"] == pytest.approx(0.5)
+    assert np.isnan(metrics.human_metrics(parked)["human_mean_speed"])
+    # Who comes into sight braking has begun to.
+    at_once = car("f", 20.0 * TIME[:3]).assign(speed=[20.0, 19.0, 18.9])
+    assert metrics.human_metrics(at_once)["human_hard_brakes"] == 1
 
 
 def test_hard_is_more_than_what_drivers_find_comfortable() -> None:
@@ -209,6 +269,18 @@ def test_the_ego_yields_once_it_is_half_a_lane_right_of_where_it_was() -> None:
         right = np.select([TIME < 2.0, TIME < 3.95], steps[:2], steps[2])
         ego["d"] = 7.0 - right
         assert metrics.emergency_metrics(info, ego, ambulance)["yield_time"] == expected
+    # From the event on, the step of the event included; two steps are enough to be held up.
+    ego["d"] = np.where(TIME < 1.05, 7.0, 0.0)
+    assert metrics.emergency_metrics(info, ego, ambulance)["yield_time"] == pytest.approx(0.1)
+    two = ambulance[(ambulance["time"] > 0.95) & (ambulance["time"] < 1.15)]
+    assert metrics.emergency_metrics(info, ego, two)["emergency_delay"] == pytest.approx(0.0)
+    for missing in (
+        {**info, "special": []},
+        {**info, "scenario": {"events": [{"near": None}]}},
+    ):
+        nothing = metrics.emergency_metrics(missing, ego, ambulance)
+        assert set(nothing) == {"emergency_delay", "yield_time"}
+        assert all(np.isnan(v) for v in nothing.values())
     ego["d"] = 7.0 + 2.0 * TIME  # to the left is out of the way of nobody
     assert np.isnan(metrics.emergency_metrics(info, ego, ambulance)["yield_time"])
 
@@ -237,6 +309,7 @@ def test_nobody_is_passed_by_a_special_vehicle_ahead_behind_or_missing() -> None
         (car("human", 79.5 + 30.0 * TIME), {**RESCUE, "special": []}),
     ):
         result = metrics.passing_metrics(info, ego, others)
+        assert set(result) == {"passing_lane", "passing_shift"}
         assert all(np.isnan(value) for value in result.values())
 
 
@@ -319,3 +392,6 @@ def test_fleet_metrics_by_hand() -> None:
     }
     alone = metrics.fleet_metrics(info, ego, pd.concat([hidden]))
     assert alone["penetration"] == 1.0
+    # In a step without anybody in sight a SUMO-driven ego is nobody's.
+    none = metrics.fleet_metrics(info, ego.assign(planned=False), pd.concat([hidden]))
+    assert none["penetration"] == 0.0
