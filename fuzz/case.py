@@ -104,14 +104,14 @@ def warm_up() -> None:
         "sumolib",
     ):
         importlib.import_module(name)
-    from sumo_cohesion.planning.registry import make_planner
+    from sumo_cohesion.simulation.request import RunRequest
     from sumo_cohesion.simulation.setup import prepare
     from sumo_cohesion.traffic.library import load_libsumo
 
     load_libsumo()
     for scenario in ("stalled", "exit"):  # solvers are made once per number of lanes
-        setup = prepare(scenario, "nominal")
-        make_planner("nominal", setup.settings, setup.cohesion).reset(setup.road)
+        setup = prepare(RunRequest(scenario, "nominal"))
+        setup.make_planner().reset(setup.road)
     _drive_here()
     gc.freeze()  # forked processes look through their own objects only
 
