@@ -89,7 +89,11 @@ def test_post_encroachment_of_several_is_the_least_and_counts_from_nothing() -> 
     stands = car("stands", np.full(51, 30.0), d=3.5)
     near, far = (car(n, gap + 5.0 + 20.0 * TIME, d=3.5) for n, gap in (("b", 10.0), ("a", 30.0)))
     for others in ([stands, near, far], [far, near, stands]):
+        later = pd.concat(others).assign(time=lambda t: t["time"] + 7.0)
         assert metrics.post_encroachment_time(ego, pd.concat(others)) == pytest.approx(0.5)
+        assert metrics.post_encroachment_time(ego.assign(time=TIME + 7.0), later) == pytest.approx(
+            0.5
+        )
     # However slowly it goes: 2 cm in a step, and the ego comes to where it has just been.
     slow = car("slow", 60.0 + 0.2 * TIME, d=3.5)
     fast = car("ego", 55.0 + 0.3 * TIME, d=3.5)
@@ -332,6 +336,21 @@ def test_aside_share_compares_each_car_when_the_special_vehicle_is_nearest() -> 
     assert metrics.aside_share(RESCUE, ego, mirrored) == pytest.approx(-0.6 / 0.8)
 
 
+def test_aside_share_is_of_those_that_start_in_the_egos_lane_and_from_where_they_start() -> None:
+    ambulance = car("ambulance", 30.0 * TIME)
+    ego = car("ego", 20.0 + 20.0 * TIME)  # passed after 2 s
+    human, other = car("human", 40.0 + 20.0 * TIME), car("other", 40.0 + 20.0 * TIME)
+    ego["d"] = np.where(TIME > 0.05, 0.4, 0.0)
+    human["d"] = np.where(TIME > 0.05, 0.8, 0.0)
+    other["d"] = 5.0 * TIME
+    # Both change their lane at once: to be in it later does not count.
+    ego["lane"] = np.where(TIME > 0.05, 1, 0)
+    human["lane"] = np.where(TIME > 0.05, 2, 0)
+    other["lane"] = np.where(TIME > 0.05, 0, 1)
+    everybody = pd.concat([ambulance, human, other])
+    assert metrics.aside_share(RESCUE, ego, everybody) == pytest.approx(0.5)
+
+
 def test_aside_share_of_cars_never_passed_is_taken_when_it_is_nearest() -> None:
     ambulance = car("ambulance", 25.0 * TIME)  # gains 5 m/s on both, never reaches them
     ego, human = car("ego", 100.0 + 20.0 * TIME), car("human", 150.0 + 20.0 * TIME)
@@ -358,6 +377,11 @@ def test_speed_gap_closed_by_hand() -> None:
     other["visible"] = True
     plan = pd.DataFrame({"time": time, "speed_limit": 25.0})
     assert metrics.speed_gap_closed(ego, other, plan) == pytest.approx(0.6)
+    # Only those within 80 m are near.
+    for away, expected in ((79.5, 1.5 / 2.0), (80.5, 0.6), (-80.5, 0.6)):
+        far = car("b", away + 26.5 * time).assign(visible=True, speed=26.5)
+        both = pd.concat([other, far])
+        assert metrics.speed_gap_closed(ego, both, plan) == pytest.approx(expected)
     other["visible"] = False
     assert np.isnan(metrics.speed_gap_closed(ego, other, plan))
 

@@ -71,6 +71,11 @@ def test_speed_is_most_agreed_where_both_its_features_lead() -> None:
     table = pd.DataFrame(rows, columns=["time", "group", "feature", "precision"])
     assert metrics.speed_most_agreed(table) == 0.5
     assert np.isnan(metrics.speed_most_agreed(table.iloc[:0]))
+    # Other groups have no say in it, and as much is not more.
+    lane = table.assign(group="lane", precision=100.0, time=table["time"] + 9.0)
+    assert metrics.speed_most_agreed(pd.concat([table, lane])) == 0.5
+    equal = table.assign(precision=5.0)[:5]
+    assert metrics.speed_most_agreed(equal) == 0.0
 
 
 def test_max_excess_speed_is_over_the_mean_of_those_near() -> None:
@@ -83,4 +88,7 @@ def test_max_excess_speed_is_over_the_mean_of_those_near() -> None:
         }
     )
     assert metrics.max_excess_speed(ego, humans) == pytest.approx(0.5)
+    for away, excess in ((80.0, 1.0), (-80.0, 1.0), (80.5, 2.0), (-80.5, 2.0)):
+        two = pd.DataFrame({"time": 0.0, "s": [away, 0.0], "speed": [30.0, 28.0]})
+        assert metrics.max_excess_speed(ego, two) == pytest.approx(excess), away
     assert np.isnan(metrics.max_excess_speed(ego, humans.iloc[:0]))
