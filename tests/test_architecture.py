@@ -71,7 +71,9 @@ def imports(path: Path) -> set[str]:
         if isinstance(node, ast.Import):
             names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module:
-            names |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
+            named = {f"{node.module}.{alias.name}" for alias in node.names}
+            modules = {name for name in named if name.removeprefix("sumo_cohesion.") in FILES}
+            names |= modules or {node.module}
         if not for_types_only(node):
             left += ast.iter_child_nodes(node)
     return names

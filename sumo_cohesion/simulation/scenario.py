@@ -11,8 +11,8 @@ from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, model_validator
 
 from sumo_cohesion.errors import UserError
 from sumo_cohesion.tables.metrics import METRICS, OF_REFERENCE
-from sumo_cohesion.traffic.demand import EgoDemand, Randomization
 from sumo_cohesion.traffic.drivers import Event
+from sumo_cohesion.traffic.settings import EgoDemand, Randomization
 from sumo_cohesion.user_input import (
     closest,
     merge,

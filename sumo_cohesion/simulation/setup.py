@@ -25,12 +25,8 @@ from sumo_cohesion.road import Road
 from sumo_cohesion.simulation.request import RunRequest
 from sumo_cohesion.simulation.scenario import Scenario, load_scenario
 from sumo_cohesion.social.settings import CohesionSettings
-from sumo_cohesion.traffic.demand import (
-    build_demand,
-    check_demand,
-    check_human_type,
-    read_demand,
-)
+from sumo_cohesion.traffic.demand import build_demand, check_demand, check_human_type
+from sumo_cohesion.traffic.demand_files import read_demand
 from sumo_cohesion.traffic.input_files import write_input_files, write_portable_files
 from sumo_cohesion.traffic.network import Network
 from sumo_cohesion.traffic.outputs import SumoOutputs

@@ -7,15 +7,12 @@ from __future__ import annotations
 
 import difflib
 import xml.etree.ElementTree as ET
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NamedTuple
-
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, NamedTuple
 
 from sumo_cohesion.errors import UserError
 from sumo_cohesion.state import EGO
+from sumo_cohesion.traffic.demand_files import AdditionalFile, Demand
 from sumo_cohesion.traffic.library import vehicle_type_attributes
 from sumo_cohesion.traffic.randomize import (
     Starts,
@@ -24,13 +21,13 @@ from sumo_cohesion.traffic.randomize import (
     seconds,
     what_stays,
 )
+from sumo_cohesion.traffic.settings import EgoDemand, Randomization
 from sumo_cohesion.traffic.vehicle_types import (
     DEFAULT_TYPE,
     VehicleTypes,
     as_built_in,
     is_built_in,
 )
-from sumo_cohesion.traffic.xml_files import contents, read_with_includes
 
 if TYPE_CHECKING:
     from sumo_cohesion.traffic.network import Network
@@ -40,114 +37,12 @@ _FASTEST = 200 / 3.6
 _WITHOUT_SUBLANES = {"LC2013", "LC2013_CC", "DK2008"}
 """Lane change models that SUMO refuses as soon as there are sublanes."""
 
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-
-
-class EgoDemand(BaseModel):
-    """Where the ego starts and where it goes.
-
-    ``position`` (m) and ``lane`` follow SUMO: front bumper from the start of the edge, lanes
-    counted from the right. ``depart`` (s) leaves other traffic time to form.
-    """
-
-    # A number is an edge's name, too: OpenStreetMap's are numbers.
-    model_config = ConfigDict(frozen=True, extra="forbid", coerce_numbers_to_str=True)
-
-    origin: str
-    destination: str
-    lane: Annotated[int, Field(ge=0)]
-    position: NonNegative
-    speed: NonNegative
-    depart: Annotated[float, Field(ge=0, le=604_800)] = 0.0  # a week, most of it empty steps
-    length: Positive = 5.0
-    width: Positive = 1.8
-
-
-class Randomization(BaseModel):
-    """What a seed varies, besides SUMO's own random numbers.
-
-    Attributes
-    ----------
-    lead_spacing : [low, high] (m) between the fronts of consecutive cars that start with the
-        ego, ahead of it in its lane, each gap drawn anew; the first gap is the ego's own.
-    position : every other vehicle or trip with a number as its departPos starts up to so many
-        metres before or after it.
-    speed : every human's desired speed changes by up to this share, on top of the speedDev of
-        its type (SUMO itself would ignore speedDev once a vehicle has a speedFactor).
-    humans : [fewest, most] human cars; the first so many of the route files are kept.
-    """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    lead_spacing: tuple[Positive, Positive] | None = None
-    position: NonNegative = 0.0
-    speed: Annotated[float, Field(ge=0, lt=1)] = 0.0
-    humans: tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]] | None = None
-
-    @model_validator(mode="after")
-    def _ordered(self) -> Randomization:
-        for name in ("lead_spacing", "humans"):
-            pair = getattr(self, name)
-            if pair is not None and pair[0] > pair[1]:
-                raise ValueError(f"{name} must be [low, high] with low <= high, not {list(pair)}")
-        return self
-
-    @property
-    def varies(self) -> bool:
-        """Whether a seed varies anything at all besides SUMO's own random numbers."""
-        return self != Randomization()
-
-
-@dataclass(frozen=True)
-class AdditionalFile:
-    """An additional file as it was read; ``changed``: it is no longer what lies on the disk."""
-
-    path: Path
-    root: ET.Element
-    changed: bool = False
-
-
-@dataclass(frozen=True)
-class Demand:
-    """What SUMO is given beside the network: all route files as one, and additional files.
-
-    ``source`` says where the routes come from, for messages.
-    """
-
-    routes: ET.Element
-    additional: tuple[AdditionalFile, ...] = ()
-    source: str = "route files"
-
-    def roots(self) -> tuple[ET.Element, ...]:
-        """All there is, in the order in which SUMO reads it: additional files come first."""
-        return (*(file.root for file in self.additional), self.routes)
-
 
 class CheckedDemand(NamedTuple):
     """The ego's route, and what there is to say about the demand, one line each."""
 
     route: list[str]
     notes: tuple[str, ...]
-
-
-def read_demand(route_files: Iterable[Path], additional: Iterable[Path] = ()) -> Demand:
-    """Read route and additional files, with what they include.
-
-    Raises
-    ------
-    UserError
-        If one is missing, unreadable, not well-formed or of another kind.
-    """
-    merged, paths = ET.Element("routes"), list(route_files)
-    for path in paths:
-        merged.extend(contents(read_with_includes(path)))
-    files = []
-    for path in additional:
-        root = ET.Element("additional")
-        root.extend(contents(read_with_includes(path)))
-        files.append(AdditionalFile(path, root))
-    return Demand(merged, tuple(files), ", ".join(map(str, paths)))
 
 
 def check_demand(

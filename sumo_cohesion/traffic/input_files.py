@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import NamedTuple
 
-from sumo_cohesion.traffic.demand import AdditionalFile, Demand
+from sumo_cohesion.traffic.demand_files import AdditionalFile, Demand
 from sumo_cohesion.traffic.xml_files import named_files
 
 DEMAND_FILE = "demand.rou.xml"

@@ -14,8 +14,9 @@ from sumo_cohesion.errors import UserError
 from sumo_cohesion.traffic.vehicle_types import DEFAULT_TYPE, SpeedFactor, VehicleTypes
 
 if TYPE_CHECKING:
-    from sumo_cohesion.traffic.demand import Demand, EgoDemand, Randomization
+    from sumo_cohesion.traffic.demand_files import Demand
     from sumo_cohesion.traffic.network import Network
+    from sumo_cohesion.traffic.settings import EgoDemand, Randomization
 
 _SAME_TIME = 1.0
 """Seconds around the ego's departure in which those depart that start ahead of it."""

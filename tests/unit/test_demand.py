@@ -11,17 +11,11 @@ import numpy as np
 import pytest
 
 from sumo_cohesion.errors import UserError
-from sumo_cohesion.traffic.demand import (
-    CheckedDemand,
-    EgoDemand,
-    Randomization,
-    build_demand,
-    check_demand,
-    check_human_type,
-    read_demand,
-)
+from sumo_cohesion.traffic.demand import CheckedDemand, build_demand, check_demand, check_human_type
+from sumo_cohesion.traffic.demand_files import read_demand
 from sumo_cohesion.traffic.library import vehicle_type_attributes
 from sumo_cohesion.traffic.network import Network
+from sumo_cohesion.traffic.settings import EgoDemand, Randomization
 from tests.conftest import ROOT
 
 EGO = EgoDemand(origin="west", destination="east", lane=0, position=100.0, speed=25.0)

@@ -12,7 +12,7 @@ import pytest
 
 from sumo_cohesion.errors import UserError
 from sumo_cohesion.simulation.scenario import Scenario
-from sumo_cohesion.traffic.demand import read_demand
+from sumo_cohesion.traffic.demand_files import read_demand
 from sumo_cohesion.traffic.network import Network
 from sumo_cohesion.traffic.xml_files import files_behind, named_files, read_with_includes
 from sumo_cohesion.user_input import parse_override, read_toml, text_settings
