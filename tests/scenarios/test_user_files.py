@@ -15,8 +15,10 @@ import pytest
 from sumo_cohesion import cli
 from sumo_cohesion.errors import UserError
 from sumo_cohesion.simulation.export import export_scenario
+from sumo_cohesion.simulation.request import RunRequest
 from sumo_cohesion.simulation.run import run
 from sumo_cohesion.simulation.setup import prepare
+from sumo_cohesion.tables.folders import MARKER
 from sumo_cohesion.traffic.simulator import Simulator
 from tests.conftest import ROOT
 
@@ -87,7 +89,7 @@ def called(name: str, text: str) -> str:
 
 def drive(scenario: Path, folder: Path, seconds: float = 3.0, seed: int = 0) -> list[str]:
     """Let SUMO drive a scenario; returns which vehicles there were, and what SUMO wrote."""
-    setup = prepare(scenario, "sumo", seed)
+    setup = prepare(RunRequest(scenario, "sumo", seed))
     sumo_run = setup.write_inputs(folder)
     with Simulator(sumo_run, setup.ego_size, setup.read_radius) as sumo:
         sumo.insert_ego(1.0)
@@ -161,7 +163,7 @@ def test_a_type_called_ego_is_the_users(write: Write, tmp_path: Path) -> None:
 
 def test_human_types_of_additional_files(write: Write, tmp_path: Path) -> None:
     scenario = write(routes=f"<routes>{WAY}{LEAD}</routes>", types=HUMAN)
-    setup = prepare(scenario, "sumo", 0, {"human_type.speedFactor": 0.4})
+    setup = prepare(RunRequest(scenario, "sumo", 0, {"human_type.speedFactor": 0.4}))
     with Simulator(setup.write_inputs(tmp_path), setup.ego_size, setup.read_radius) as sumo:
         scene = sumo.insert_ego(1.0)
         for _ in range(100):
@@ -176,7 +178,7 @@ def test_human_types_that_are_built_in(write: Write, tmp_path: Path) -> None:
     early = mine.replace("lead", "early").replace('departLane="0"', 'departLane="1"')
     way = WAY.replace('"r"', '"q"')
     scenario = write(routes=f"<routes>{WAY}{mine}</routes>", cars=way + early.replace("'r'", "'q'"))
-    setup = prepare(scenario, "sumo", 0, {"human_type.length": 7.5})
+    setup = prepare(RunRequest(scenario, "sumo", 0, {"human_type.length": 7.5}))
     with Simulator(setup.write_inputs(tmp_path), setup.ego_size, setup.read_radius) as sumo:
         scene = sumo.insert_ego(1.0)
     assert dict(zip(scene.ids, scene.sizes[:, 0], strict=True)) == {"lead": 7.5, "early": 7.5}
@@ -187,7 +189,7 @@ def test_cars_of_a_flow_want_different_speeds(write: Write, tmp_path: Path) -> N
         '<flow id="f" type="h" begin="0" period="0.5" from="west" to="east" departLane="random"/>'
     )
     scenario = write(routes=f"<routes>{HUMAN}{flow}</routes>")
-    setup = prepare(scenario, "sumo", 0, {"randomize.speed": 0.1})
+    setup = prepare(RunRequest(scenario, "sumo", 0, {"randomize.speed": 0.1}))
     factors: dict[str, float] = {}
     with Simulator(setup.write_inputs(tmp_path), setup.ego_size, setup.read_radius) as sumo:
         sumo.insert_ego(1.0)
@@ -243,7 +245,9 @@ def test_devices_of_types_write_into_the_runs_folder(
 
 
 def test_a_run_without_outputs_has_no_folder_for_them(write: Write, tmp_path: Path) -> None:
-    sumo_run = prepare(write(poi='<poi id="p" x="0" y="0"/>'), "sumo").write_inputs(tmp_path)
+    sumo_run = prepare(RunRequest(write(poi='<poi id="p" x="0" y="0"/>'), "sumo")).write_inputs(
+        tmp_path
+    )
     assert sumo_run.output_folder is None
     assert [path.name for path in tmp_path.glob("*.xml")] == ["demand.rou.xml"]
 
@@ -284,7 +288,7 @@ def test_export_of_files_of_one_name(write: Write, tmp_path: Path) -> None:
     scenario.write_text(text)
     config = export_scenario(scenario, tmp_path / "out")
     assert plain_sumo(config) == {"ego", "lead"}
-    assert {path.name for path in config.parent.iterdir()} == {
+    assert {path.name for path in config.parent.iterdir()} - {MARKER} == {
         "scenario.sumocfg", "demand.rou.xml", "demand_2.rou.xml", "same.add.xml",
         "same_2.add.xml", "loops.xml",
     }  # fmt: skip
