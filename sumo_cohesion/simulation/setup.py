@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import difflib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
 from sumo_cohesion.errors import UserError
 from sumo_cohesion.perception.observation import Sensor
@@ -22,6 +20,7 @@ from sumo_cohesion.planning.registry import (
 from sumo_cohesion.planning.route import check_road
 from sumo_cohesion.planning.settings import PlannerSettings
 from sumo_cohesion.road import Road
+from sumo_cohesion.simulation.overrides import settings_from
 from sumo_cohesion.simulation.request import RunRequest
 from sumo_cohesion.simulation.scenario import Scenario, load_scenario
 from sumo_cohesion.social.settings import CohesionSettings
@@ -31,7 +30,6 @@ from sumo_cohesion.traffic.input_files import write_input_files, write_portable_
 from sumo_cohesion.traffic.network import Network
 from sumo_cohesion.traffic.outputs import SumoOutputs
 from sumo_cohesion.traffic.simulator import SumoRun
-from sumo_cohesion.user_input import merge, validated
 
 _MARGIN = 50.0
 """Metres beyond the sensing range that are read and recorded, too."""
@@ -136,42 +134,6 @@ class Setup(Inputs):
             outputs=self.outputs,
             output_folder=files.outputs,
         )
-
-
-def settings_from(
-    overrides: Mapping[str, Any],
-) -> tuple[PlannerSettings, CohesionSettings, dict[str, Any]]:
-    """Split dotted overrides into planner settings, cohesion settings and scenario overrides."""
-    parts: dict[str, dict[str, Any]] = {"planner": {}, "cohesion": {}, "": {}}
-    for name, value in overrides.items():
-        head, _, tail = name.partition(".")
-        if tail and head in parts:
-            parts[head][tail] = value
-        elif head in Scenario.model_fields:
-            parts[""][name] = value
-        else:
-            raise UserError(f"unknown setting {name!r}{_meant(name)}")
-    planner = validated(PlannerSettings, merge({}, parts["planner"]), "planner settings")
-    cohesion = validated(CohesionSettings, merge({}, parts["cohesion"]), "cohesion settings")
-    return planner, cohesion, parts[""]
-
-
-def _meant(name: str) -> str:
-    """Suggest settings that are spelt like an unknown one, or all there is to set."""
-    groups = {"planner": PlannerSettings.model_fields, "cohesion": CohesionSettings.model_fields}
-    head, dot, tail = name.partition(".")
-    if head in groups:
-        return (
-            f"; it is a group: set one of {', '.join(f'{head}.{key}' for key in groups[head])}; "
-            "which planner drives is said by --planner, --planners or an experiment's planners"
-        )
-    same = [f"{group}.{name}" for group, fields in groups.items() if name in fields]
-    close = difflib.get_close_matches(head, [*groups, *Scenario.model_fields], 1)
-    meant = same or [close[0] + dot + tail] if same or close else []
-    if meant:
-        return f"; did you mean {meant[0]!r}?"
-    known = ", ".join(Scenario.model_fields)
-    return f"; settings are planner.*, cohesion.*, and of the scenario {known}"
 
 
 def resolve(request: RunRequest) -> Inputs:

@@ -20,7 +20,7 @@ import pandas as pd
 from sumo_cohesion import Rollout, run
 from sumo_cohesion.planning.registry import BUILT_IN
 from sumo_cohesion.simulation.scenario import scenario_files
-from sumo_cohesion.tables.columns import METRICS
+from sumo_cohesion.tables.metrics import METRICS
 from sumo_cohesion.versions import versions
 
 HERE = Path(__file__).resolve().parent
