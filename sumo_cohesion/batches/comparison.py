@@ -129,7 +129,7 @@ def compare(
                 raise
             kept = keep(new, folder)
             kind = UserError if isinstance(error, UserError) else SimulationError
-            reason = str(error) or "interrupted"
+            reason = (str(error) or "interrupted").replace(str(new), str(kept))
             raise kind(f"{reason}; finished runs are kept in {kept}") from error
         comparison = _compared(jobs, results, folder)
         comparison.runs.to_parquet(new / "metrics.parquet", index=False)

@@ -227,3 +227,12 @@ def test_a_mistake_that_sumo_meets_later_loses_nothing(late_mistake: Path) -> No
         run(late_mistake, "nominal", 3, overrides=everybody)
     assert isinstance(again.value.rollout, Rollout)
     same(again.value.rollout, kept)
+
+
+def test_a_comparison_that_sumo_stops_says_where_everything_is(late_mistake: Path) -> None:
+    out, everybody = late_mistake.parent / "out", {**SHORT, "randomize.humans": [99, 99]}
+    with pytest.raises(UserError, match="SUMO stopped at 1 s") as error:
+        compare(late_mistake, "nominal", (3,), overrides=everybody, out=out, workers=1)
+    kept = late_mistake.parent / "out.unfinished" / "nominal" / "seed_0003"
+    assert f"what was recorded until then is in {kept}" in str(error.value)
+    assert Rollout.read(kept).info["outcome"] == "stopped"
