@@ -191,7 +191,7 @@ class Greedy(Steady):
 
 
 def test_a_planners_slip_does_not_reach_another_run() -> None:
-    with pytest.raises(ValueError, match="read-only"):
+    with pytest.raises(UserError, match="read-only"):
         run("speeding", Greedy, 1000, overrides=SHORT)
     assert run("speeding", "sumo", 1000, overrides=SHORT).plan["speed_limit"].eq(25.0).all()
 
