@@ -68,7 +68,7 @@ class Fleet:
         self._members: dict[str, PlannedCar] = {}
         self._features = SharedFeatures()
         self._human: set[str] = set(setup.not_human)  # never taken in (again)
-        self._were_planned: set[str] = set()
+        self._were_planned = {EGO}
         self._touched: dict[str, list[str]] = {}
         self._without_road: dict[str, str] = {}
         self._failures = 0
@@ -81,7 +81,7 @@ class Fleet:
         What a car did while it was planned stays remembered, so it is no human's vote later on.
         If egos follow egos, only wrecks are left.
         """
-        return self._touched if self._setup.cohesion.follow_egos else {EGO, *self._were_planned}
+        return self._touched if self._setup.cohesion.follow_egos else self._were_planned
 
     def meet(self, scene: Scene, register: Register) -> None:
         """Hand back who is no longer to be planned, and take in who is now; once per scene."""
