@@ -184,7 +184,7 @@ def parse_seeds(given: object, what: str = "--seeds") -> list[int]:
         return seeds_of(given)
     except ValueError as error:
         shown = repr(given)
-        shown = shown if len(shown) < _LONGEST else f"{shown[:_LONGEST]}..."
+        shown = _cut(shown)
         raise UserError(f"{what} {shown}: {error}") from None
 
 
@@ -223,9 +223,13 @@ def validated(model: type[Model], data: object, where: str) -> Model:
             raise UserError(f"{where}: unknown key {key!r}{hint}{rest}") from None
         said = _IN_TOML.get(first["type"], first["msg"].removeprefix("Value error, "))
         got = first.get("input")
-        shown = f" (got {got!r})" if isinstance(got, str | int | float | bool | list) else ""
+        shown = f" (got {_cut(repr(got))})" if isinstance(got, str | int | float | list) else ""
         prefix = f"{where}: {key}: " if key else f"{where}: "
         raise UserError(prefix + said[:1].lower() + said[1:] + shown + rest) from None
+
+
+def _cut(text: str) -> str:
+    return text if len(text) < _LONGEST else f"{text[:_LONGEST]}..."
 
 
 def _fields_at(model: type[BaseModel], loc: Sequence[int | str]) -> list[str]:

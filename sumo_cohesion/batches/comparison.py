@@ -4,15 +4,22 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from html import escape
+from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import pandas as pd
 
-from sumo_cohesion.batches.workers import NO_LIMITS, CallFailedError, Workers, processors
+from sumo_cohesion.batches.workers import (
+    NO_LIMITS,
+    CallFailedError,
+    Workers,
+    processors,
+    stopped_by_signals,
+)
 from sumo_cohesion.errors import SimulationError, UserError
 from sumo_cohesion.planning.registry import AnyPlanner, planner_name
 from sumo_cohesion.simulation.request import RunRequest
@@ -109,13 +116,37 @@ def compare(
         except ValueError as error:
             raise UserError(f"{what} {error}") from None
     requests = [RunRequest(str(scenario), p, s, overrides or {}) for p in planners for s in seeds]
+    ends = {min(seeds), max(seeds)}
     for request in requests:
-        if request.seed in (min(seeds), max(seeds)):
+        if request.seed in ends:
             prepare(request)
-    folder = Path(out) if out is not None else None
-    if folder is None:
-        jobs = [_Job(request, None) for request in requests]
-        return _compared(jobs, _run_all(jobs, workers, progress), None)
+    about = {
+        "scenario": str(scenario),
+        "planners": [planner_name(planner) for planner in planners],
+        "seeds": list(seeds),
+        "overrides": dict(overrides or {}),
+    }
+    text = json.dumps(about, indent=2, default=_plain) + "\n"
+    with stopped_by_signals():
+        if out is None:
+            jobs = [_Job(request, None) for request in requests]
+            return _compared(jobs, _run_all(jobs, workers, progress), None)
+        return _compared_in(Path(out), requests, text, workers, progress)
+
+
+def _plain(value: Any) -> Any:
+    """Return what JSON has for a NumPy number or array, or a text."""
+    return value.tolist() if hasattr(value, "tolist") else str(value)
+
+
+def _compared_in(
+    folder: Path,
+    requests: Sequence[RunRequest],
+    about: str,
+    workers: int | None,
+    progress: Progress | None,
+) -> Comparison:
+    """Compare, and write all of it to a folder; whatever happens, finished runs are kept."""
     require_replaceable(folder)
     with whole_folder(folder) as new:
         jobs = [
@@ -123,25 +154,25 @@ def compare(
             for request in requests
         ]
         try:
-            results = _run_all(jobs, workers, progress)
-        except (SimulationError, UserError, KeyboardInterrupt) as error:
+            comparison = _compared(jobs, _run_all(jobs, workers, progress), folder)
+            comparison.runs.to_parquet(new / "metrics.parquet", index=False)
+            comparison.summary.to_parquet(new / "summary.parquet", index=False)
+            (new / COMPARISON_FILE).write_text(about, encoding="utf-8")
+        except BaseException as error:
             if not any(new.rglob(RUN_FILE)):
                 raise
             kept = keep(new, folder)
-            kind = UserError if isinstance(error, UserError) else SimulationError
-            reason = (str(error) or "interrupted").replace(str(new), str(kept))
+            kind = UserError if isinstance(error, UserError | OSError) else SimulationError
+            reason = _reason(error).replace(str(new), str(kept))
             raise kind(f"{reason}; finished runs are kept in {kept}") from error
-        comparison = _compared(jobs, results, folder)
-        comparison.runs.to_parquet(new / "metrics.parquet", index=False)
-        comparison.summary.to_parquet(new / "summary.parquet", index=False)
-        about = {
-            "scenario": str(scenario),
-            "planners": [planner_name(planner) for planner in planners],
-            "seeds": list(seeds),
-            "overrides": dict(overrides or {}),
-        }
-        (new / COMPARISON_FILE).write_text(json.dumps(about, indent=2) + "\n", encoding="utf-8")
     return comparison
+
+
+def _reason(error: BaseException) -> str:
+    if isinstance(error, KeyboardInterrupt):
+        return "interrupted"
+    known = isinstance(error, UserError | SimulationError)
+    return str(error) if known else f"{type(error).__name__}: {error}"
 
 
 def _compared(jobs: Sequence[_Job], results: Sequence[_Result], folder: Path | None) -> Comparison:
@@ -173,18 +204,33 @@ def _results(jobs: Sequence[_Job], count: int) -> Iterator[tuple[int, _Result]]:
     workers = Workers(f"{__name__}:_run_job", NO_LIMITS)
     executor = ThreadPoolExecutor(count)
     by_name = [i for i, job in enumerate(jobs) if isinstance(job.request.planner, str)]
+    left, waiting = iter(by_name), dict[Future[_Result], int]()
+
+    def fill_up() -> None:
+        for i in islice(left, 2 * count - len(waiting)):
+            waiting[executor.submit(_called, workers, jobs[i])] = i
+
     try:
-        waiting = {executor.submit(workers.call, jobs[i]): i for i in by_name}
+        fill_up()
         for i in sorted(set(range(len(jobs))) - set(by_name)):
             yield i, _run_job(jobs[i])
         while waiting:
             for future in wait(waiting, return_when=FIRST_COMPLETED).done:
                 yield waiting.pop(future), future.result()
-    except CallFailedError as error:
-        raise SimulationError(error.reason) from None
+            fill_up()
     finally:
         workers.close()  # first, so that no thread waits for a run
         executor.shutdown(cancel_futures=True)
+
+
+def _called(workers: Workers, job: _Job) -> _Result:
+    """Run a job in a process of its own; say which it was that failed."""
+    try:
+        result: _Result = workers.call(job)
+    except CallFailedError as error:
+        which = f"{planner_name(job.request.planner)}, seed {job.request.seed}"
+        raise SimulationError(f"{which}: {error.reason}") from None
+    return result
 
 
 def _run_job(job: _Job) -> _Result:

@@ -62,7 +62,10 @@ def code_digest() -> str:
     """
     digest = hashlib.sha256()
     for name, path in sorted(code_of_a_run().items()):
-        parts = [(c.co_code, _values(c), c.co_names, c.co_varnames) for c in _compiled(path)]
+        parts = [
+            (c.co_code, c.co_exceptiontable, _values(c), c.co_names, c.co_varnames)
+            for c in _compiled(path)
+        ]
         digest.update(f"{name} {parts}".encode())
     digest.update(json.dumps(versions(), sort_keys=True).encode())
     return digest.hexdigest()
@@ -165,7 +168,11 @@ def _imported(module: Path) -> set[Path]:
     while left:
         path = left.pop()
         found.add(path)
-        for node in ast.walk(ast.parse(path.read_bytes())):
+        try:
+            tree = ast.parse(path.read_bytes())
+        except (SyntaxError, ValueError):  # no Python source: its content counts, no more
+            continue
+        for node in ast.walk(tree):
             names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
             if isinstance(node, ast.ImportFrom) and node.module and not node.level:
                 names.append(node.module)

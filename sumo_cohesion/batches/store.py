@@ -28,9 +28,10 @@ import pandas as pd
 from sumo_cohesion.errors import StorageError, UserError
 from sumo_cohesion.locks import alone
 from sumo_cohesion.tables.columns import BATCH
+from sumo_cohesion.tables.folders import BATCH_FILE
 from sumo_cohesion.tables.metrics import METRICS
 
-MANIFEST = "manifest.json"
+MANIFEST = BATCH_FILE
 FORMAT = 1
 ROWS_PER_PART = 1000
 DONE = "done"

@@ -382,7 +382,9 @@ def _installed_first(paths: Sequence[str]) -> list[str]:
 
 
 def _end() -> NoReturn:
-    """End this process and all that it started."""
+    """End this process and all that it started, with the files that it has left."""
+    if "sumo-cohesion-" in os.environ.get("TMPDIR", ""):
+        shutil.rmtree(os.environ["TMPDIR"], ignore_errors=True)
     with contextlib.suppress(AttributeError):  # Windows
         if os.getpgrp() == os.getpid():  # a group of its own
             os.killpg(0, signal.SIGKILL)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 
 import click
@@ -75,9 +75,8 @@ def figure(
         from sumo_cohesion.report.grid import draw_grid
         from sumo_cohesion.tables.folders import claim
 
-        with tables_of(folder):
-            picture = out or claim(folder, f"{metric}.png")
-            path = draw_grid(load_metrics(folder), metric, over, panels, picture)
+        with tables_of(folder), nullcontext(out) if out else claim(folder, f"{metric}.png") as path:
+            draw_grid(load_metrics(folder), metric, over, panels, path)
         click.echo(path)
         return
     from sumo_cohesion.report.paths import draw_comparison, draw_run

@@ -18,7 +18,7 @@ import numpy as np
 from sumo_cohesion.errors import UserError
 from sumo_cohesion.perception.history import History
 from sumo_cohesion.road import Road
-from sumo_cohesion.state import Control, Observation, Plan
+from sumo_cohesion.state import Control, FloatArray, Observation, Plan
 
 SHARPEST, HARDEST = 1.0, 100.0
 """Curvature (1/m) and acceleration (m/s²) beyond which a control is not that of a car."""
@@ -103,6 +103,18 @@ def accepted(plan: object) -> Plan:
     if controls and not _is_physical(controls[0]):
         raise UnusablePlanError("control is not finite, or not that of a car")
     return replace(plan, controls=controls)
+
+
+def planned_states(plan: Plan) -> FloatArray:
+    """Road states that a plan leads to, (n, 4); a user's planner need not say, or not so.
+
+    A copy: a planner may write every plan into the same array.
+    """
+    try:
+        states = np.array(plan.states, dtype=float)
+    except (TypeError, ValueError):
+        states = np.empty(0)
+    return states[1:] if states.ndim == 2 and states.shape[1] == 4 else np.empty((0, 4))
 
 
 def described(error: BaseException) -> str:

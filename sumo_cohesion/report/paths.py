@@ -25,8 +25,7 @@ PICTURE = "paths.png"
 
 def draw_run(folder: Path, out: Path | None = None) -> Path:
     """Draw one run from its folder; returns the picture's path."""
-    rollout = Rollout.read(folder)
-    return drawing.save(_draw([rollout]), out or claim(folder, PICTURE))
+    return _saved(_draw([Rollout.read(folder)]), folder, out)
 
 
 def draw_comparison(folder: Path, out: Path | None = None, seed: int | None = None) -> Path:
@@ -39,7 +38,14 @@ def draw_comparison(folder: Path, out: Path | None = None, seed: int | None = No
     if chosen not in about["seeds"]:
         raise UserError(f"{folder}: has no seed {chosen}; its seeds are {about['seeds']}")
     rollouts = [Rollout.read(run_folder(folder, p, chosen)) for p in about["planners"]]
-    return drawing.save(_draw(rollouts), out or claim(folder, PICTURE))
+    return _saved(_draw(rollouts), folder, out)
+
+
+def _saved(figure: Figure, folder: Path, out: Path | None) -> Path:
+    if out is not None:
+        return drawing.save(figure, out)
+    with claim(folder, PICTURE) as path:
+        return drawing.save(figure, path)
 
 
 def _draw(rollouts: list[Rollout]) -> Figure:

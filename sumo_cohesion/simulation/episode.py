@@ -38,6 +38,7 @@ if TYPE_CHECKING:
 
 TERMINAL = ("collision", "left_route", "route_end")
 """Outcomes after which nothing is left to decide; any other cuts a run off."""
+_NOT_STARTED = "not started"
 _LOST = 10.0
 """Metres from the nearest lane of its route, or off it, beyond which the ego has left both."""
 _PATIENCE = 60.0
@@ -109,7 +110,7 @@ class Episode:
 
     At most one runs per process. ``outcome`` is empty while it goes on. Then the run has either
     *terminated* (a collision, the end of the route, or the ego left it) or was *truncated* (its
-    time was up, or SUMO stopped): what would have come is unknown.
+    time was up, SUMO stopped, or it was closed): what would have come is unknown.
 
     Parameters
     ----------
@@ -142,7 +143,7 @@ class Episode:
         self._outputs = outputs
         self._sensor = setup.sensor
         self._open = contextlib.ExitStack()
-        self.outcome = "not started"
+        self.outcome = _NOT_STARTED
 
     def __enter__(self) -> Episode:
         return self
@@ -157,6 +158,7 @@ class Episode:
 
     def close(self) -> None:
         """End SUMO; the last observation and outcome stay."""
+        self.outcome = self.outcome or "closed"
         self._open.close()
 
     def reset(self) -> Observation:
@@ -189,7 +191,7 @@ class Episode:
     @property
     def truncated(self) -> bool:
         """Tell whether the run was cut off."""
-        return bool(self.outcome) and not self.terminated
+        return self.outcome not in ("", _NOT_STARTED, *TERMINAL)
 
     @property
     def scene(self) -> Scene:

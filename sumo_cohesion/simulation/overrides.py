@@ -20,7 +20,7 @@ def settings_from(
     parts: dict[str, dict[str, Any]] = {"planner": {}, "cohesion": {}, "": {}}
     for name, value in overrides.items():
         head, _, tail = name.partition(".")
-        if tail and head in parts:
+        if tail and head and head in parts:
             parts[head][tail] = value
         elif head in Scenario.model_fields:
             parts[""][name] = value

@@ -11,6 +11,7 @@ import pandas as pd
 
 from sumo_cohesion.errors import SimulationError
 from sumo_cohesion.planning.explanation import Explanation
+from sumo_cohesion.planning.planners import planned_states
 from sumo_cohesion.planning.reward import TERMS
 from sumo_cohesion.simulation.episode import Ending, Moment, Seconds
 from sumo_cohesion.social.features import FEATURES, LATERAL
@@ -46,6 +47,9 @@ class Recorder:
         self._setup = setup
         self._road = setup.road
         self._reference = reference
+        self._begin()
+
+    def _begin(self) -> None:
         self._scenes: list[Scene] = []
         self._visible: list[frozenset[str]] = []
         self._planned: list[frozenset[str]] = []
@@ -60,27 +64,30 @@ class Recorder:
         return bool(self._plans) and self._ending is not None
 
     def on_step(self, moment: Moment) -> None:
-        """Record one step."""
+        """Record one step; the first after an end begins another record."""
+        if self._ending is not None:
+            self._begin()
         plan, others = moment.plan, moment.planned
         self._scenes.append(self._recorded(moment.scene))
         self._visible.append(frozenset(moment.observation.ids))
         self._planned.append(others | {EGO} if plan.controls else others)
         self._plans.append((moment.scene.time, moment.observation.ego, plan))
-        self._horizons.append(_planned(plan))
+        self._horizons.append(planned_states(plan))
         self._seconds.append(moment.seconds)
 
     def on_end(self, ending: Ending) -> None:
         """Record how it ended."""
         self._ending = ending
+        if self._plans:
+            self._scenes.append(self._recorded(ending.scene))
+            self._visible.append(self._visible[-1])
+            self._planned.append(self._planned[-1])
 
     def rollout(self) -> Rollout:
         """Make the tables of a run that has ended."""
         setup, ending = self._setup, self._ending
         if not self.heard or ending is None:
             raise SimulationError("nothing was recorded: the run has not ended, or had no step")
-        self._scenes.append(self._recorded(ending.scene))
-        self._visible.append(self._visible[-1])
-        self._planned.append(self._planned[-1])
         trajectory = self._trajectory(ending.scene.ego_size)
         reference = as_table("reference", list(self._reference))
         plan, agreement, timing = self._plan_table(), self._agreement_table(), self._timing_table()
@@ -98,7 +105,7 @@ class Recorder:
             "hidden": list(setup.scenario.sensing.hidden),
             "special": list(setup.scenario.sensing.special),
             "features": {**dict(zip(FEATURES, LATERAL, strict=True)), "place": True},
-            "solver": self._plans[0][2].solver,
+            "solver": str(self._plans[0][2].solver),
             "n_route_lanes": setup.road.n_route_lanes,
             "traffic_lights": list(setup.traffic_lights),
             "notes": list(setup.notes),
@@ -226,8 +233,8 @@ class Recorder:
             {
                 "time": [time for time, _, _ in self._plans],
                 "perception_ms": milliseconds[:, 0],
-                "social_ms": [1e3 * plan.social_time for _, _, plan in self._plans],
-                "solver_ms": [1e3 * plan.wall_time for _, _, plan in self._plans],
+                "social_ms": [1e3 * as_number(plan.social_time) for _, _, plan in self._plans],
+                "solver_ms": [1e3 * as_number(plan.wall_time) for _, _, plan in self._plans],
                 "plan_ms": milliseconds[:, 1],
                 "fleet_ms": milliseconds[:, 2],
                 "sumo_ms": milliseconds[:, 3],
@@ -241,15 +248,3 @@ def as_number(value: object) -> float:
         return float(value)  # type: ignore[arg-type]
     except (TypeError, ValueError):
         return float("nan")
-
-
-def _planned(plan: Plan) -> FloatArray:
-    """Road states that a plan leads to, (n, 4); a user's planner need not say, or not so.
-
-    A copy: a planner may write every plan into the same array.
-    """
-    try:
-        states = np.array(plan.states, dtype=float)
-    except (TypeError, ValueError):
-        states = np.empty(0)
-    return states[1:] if states.ndim == 2 and states.shape[1] == 4 else np.empty((0, 4))

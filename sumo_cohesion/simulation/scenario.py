@@ -64,6 +64,8 @@ class Bounds(_Data):
     def _not_empty(self) -> Bounds:
         if self.min is None and self.max is None:
             raise ValueError("give min, max or both")
+        if self.min is not None and self.max is not None and self.min > self.max:
+            raise ValueError(f"min {self.min:g} is more than max {self.max:g}")
         return self
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from operator import index
 from pathlib import Path
 
 from sumo_cohesion.errors import UserError
@@ -162,9 +163,7 @@ def prepare(request: RunRequest) -> Setup:
     UserError
         If the scenario, its network or demand, the planner or a setting is wrong.
     """
-    seed, planner = request.seed, request.planner
-    if not 0 <= seed < 2**31:
-        raise UserError(f"seed {seed} is out of range; SUMO takes 0 to 2147483647")
+    seed, planner = _seed(request.seed), request.planner
     inputs = resolve(request)
     loaded = inputs.scenario
     if isinstance(planner, str):
@@ -193,6 +192,16 @@ def prepare(request: RunRequest) -> Setup:
         traffic_lights=tuple(network.traffic_lights(route)),
         notes=notes,
     )
+
+
+def _seed(given: object) -> int:
+    try:
+        seed = int(index(given))  # type: ignore[arg-type]
+    except TypeError:
+        raise UserError(f"seed {given!r} is no whole number") from None
+    if not 0 <= seed < 2**31:
+        raise UserError(f"seed {seed} is out of range; SUMO takes 0 to 2147483647")
+    return seed
 
 
 def _version(path: Path) -> tuple[int, int]:

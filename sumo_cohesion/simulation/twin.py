@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sumo_cohesion.planning.cohesive import CohesivePlanner
+from sumo_cohesion.planning.planners import planned_states
 from sumo_cohesion.planning.registry import cohesion_of
 from sumo_cohesion.simulation.car import PlannedCar
 from sumo_cohesion.social.memory import new_history
@@ -42,15 +43,20 @@ class Twin:
             CohesivePlanner(setup.settings, nominal), setup.road, self._history, setup.settings
         )
         self._state: CartesianState | None = None
+        self._ended = False
         self.rows: list[dict[str, object]] = []
 
     def on_step(self, moment: Moment) -> None:
         """Compare one step's plan with the nominal one, and drive the twin one step."""
+        if self._ended:  # another run begins
+            self._ended, self._state = False, None
+            self.rows.clear()
         plan, observation = moment.plan, moment.observation
         nominal = self._from_here.plan(observation, self._history)
         self._from_here.continue_from(plan.controls[0] if plan.controls else None)
-        if len(plan.states) == len(nominal.states):
-            change = plan.states - nominal.states
+        planned, expected = planned_states(plan), planned_states(nominal)
+        if len(planned) == len(expected) > 0:
+            change = planned - expected
             lateral, speed = change[np.abs(change).argmax(axis=0), range(4)][[1, 3]]
         else:
             lateral = speed = np.nan  # SUMO drives, a fallback or last resort: nothing to compare
@@ -68,5 +74,6 @@ class Twin:
         )
         self._state = self._car.drive(state, self._car.step(seen))
 
-    def on_end(self, ending: Ending) -> None:
-        """Nothing is left to do."""
+    def on_end(self, ending: Ending) -> None:  # noqa: ARG002
+        """Whatever comes next is another run."""
+        self._ended = True

@@ -10,6 +10,7 @@ import contextlib
 import json
 import shutil
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 from types import TracebackType
 
@@ -17,6 +18,8 @@ from sumo_cohesion.errors import UserError
 
 MARKER = ".sumo-cohesion.json"
 """File that lists, by relative path, which files of a folder are the result's."""
+BATCH_FILE = "manifest.json"
+"""File of a batch's folder (batches.store), which is gone on with and never replaced."""
 
 
 def require_replaceable(folder: Path) -> None:
@@ -25,7 +28,7 @@ def require_replaceable(folder: Path) -> None:
     That is one that is not there yet, is empty, or holds an earlier result.
     """
     try:
-        holds_other = folder.is_dir() and any(folder.iterdir()) and not (folder / MARKER).is_file()
+        holds_other = folder.is_dir() and any(folder.iterdir()) and not _is_result(folder)
         if holds_other or (folder.exists() and not folder.is_dir()):
             raise UserError(
                 f"{folder}: holds something else than an earlier result; choose another --out"
@@ -71,26 +74,40 @@ class whole_folder:  # noqa: N801 - reads as a function where it is used
                 _move_into(self._target, self._new)
             else:
                 self._new.rename(self._target)
-        except (OSError, UserError) as problem:
-            said = problem.strerror or problem if isinstance(problem, OSError) else problem
+        except BaseException as problem:
             kept = keep(self._new, self._target)
+            if not isinstance(problem, OSError | UserError):
+                raise
+            said = problem.strerror or problem if isinstance(problem, OSError) else problem
             raise UserError(
                 f"{self._folder}: {said}; the new result is kept in {kept}; choose another --out"
             ) from None
 
 
 def keep(new: Path, folder: Path) -> Path:
-    """Move unfinished work to a name beside a folder that nobody has; returns where it is."""
-    for number in range(1, 1000):
-        free = folder.with_name(f"{folder.name}.unfinished" + (f"-{number}" if number > 1 else ""))
-        if not free.exists():
-            with contextlib.suppress(OSError):
-                return new.rename(free)
+    """Move unfinished work to a name that nobody has, beside a folder or else in it.
+
+    Returns where it is.
+    """
+    folder = folder.resolve()
+    for place in (folder.with_name(f"{folder.name}.unfinished"), new.with_name("unfinished")):
+        for number in range(1, 1000):
+            free = place if number == 1 else place.with_name(f"{place.name}-{number}")
+            if not free.exists():
+                with contextlib.suppress(OSError):  # another disk, or not to be written to
+                    return new.rename(free)
+                break
     return new
 
 
-def claim(folder: Path, name: str) -> Path:
-    """Return the path of one more file of a result, after noting that it is the result's.
+def _is_result(folder: Path) -> bool:
+    """Tell whether a folder holds a result that another may replace: a batch's never is."""
+    return (folder / MARKER).is_file() and not (folder / BATCH_FILE).is_file()
+
+
+@contextlib.contextmanager
+def claim(folder: Path, name: str) -> Iterator[Path]:
+    """Context: the path of one more file of a result, which is the result's once it is written.
 
     Raises
     ------
@@ -98,13 +115,11 @@ def claim(folder: Path, name: str) -> Path:
         If somebody else's file has this name.
     """
     path, files = folder / name, _listed(folder)
-    if name in files:
-        return path
-    if path.exists():
+    if path.exists() and name not in files:
         raise UserError(f"{path}: is not of this result and stays; name another file with --out")
-    with contextlib.suppress(OSError):  # who may not write here is told so by the caller
+    yield path
+    with contextlib.suppress(OSError):
         _write_list(folder, [*files, name])
-    return path
 
 
 def _new_beside(folder: Path) -> Path:
@@ -151,14 +166,20 @@ def _move_into(folder: Path, new: Path) -> None:
                     (target / name).parent.mkdir(parents=True, exist_ok=True)
                     moved.append((source / name, (target / name)))
                     (source / name).rename(target / name)
-    except OSError:
+    except BaseException:  # Ctrl-C, too
+        restored = True
         for source_file, target_file in reversed(moved):
-            with contextlib.suppress(OSError):
+            try:
                 target_file.rename(source_file)
+            except FileNotFoundError:  # the one that could not be moved
+                restored = restored and source_file.exists()
+            except OSError:
+                restored = False
+        if restored:
+            shutil.rmtree(old, ignore_errors=True)
         raise
-    finally:
-        shutil.rmtree(old, ignore_errors=True)
-    shutil.rmtree(new, ignore_errors=True)
+    for done in (old, new):
+        shutil.rmtree(done, ignore_errors=True)
     _remove_emptied(folder, earlier)
 
 

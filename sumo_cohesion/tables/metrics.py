@@ -242,8 +242,9 @@ def emergency_metrics(
     driven = float(after["s"].iloc[-1] - after["s"].iloc[0])
     own = ego[ego["time"] >= event]
     aside = own[own["d"] < own["d"].iloc[0] - LANE_WIDTH / 2]
+    fastest = float(vehicle["speed"].max())
     return {
-        "emergency_delay": passed - driven / float(vehicle["speed"].max()),
+        "emergency_delay": passed - driven / fastest if fastest > 0.0 else np.nan,
         "yield_time": float(aside["time"].iloc[0] - event) if len(aside) else np.nan,
     }
 

@@ -140,7 +140,7 @@ class Drivers:
 
     def _order(self, number: int, event: Event, name: str, time: float, sumo: Commands) -> None:
         key = number, name
-        if key not in self._rng:
+        if key not in self._due:
             self._rng[key] = np.random.default_rng([self._seed, number, crc32(name.encode())])
             delay = self._rng[key].normal(event.reaction, event.reaction_std)
             if event.every is not None:
@@ -148,7 +148,8 @@ class Drivers:
             self._due[key] = time + max(float(delay), 0.0)
         if time < self._due[key]:
             return
-        rng = self._rng[key]
+        # Who is told once needs no more numbers: a day's flow has many cars.
+        rng = self._rng[key] if event.every else self._rng.pop(key)
         self._due[key] = time + float(rng.uniform(*event.every)) if event.every else np.inf
         if event.lane is not None:
             sumo.order_lane(name, event.lane, event.patience)

@@ -107,23 +107,31 @@ class Starts:
         if metres == 0.0 or at is None:
             return
         edge = self.edge(vehicle)
-        length = self.length(edge)
+        length, stops = self.length(edge), self._stops(vehicle, edge)
         offset = length or 0.0
         if at < 0.0 and length is None:  # from the end of we do not know what
             metres = min(metres, -0.001 - at)
         else:
             at += offset if at < 0.0 else 0.0
-            metres = max(metres, -at)
-            metres = metres if length is None else min(metres, max(length - at, 0.0))
+            places = [at, *(place + (offset if place < 0.0 else 0.0) for *_, place in stops)]
+            metres = max(metres, -min(places))
+            if length is not None:
+                metres = min(metres, max(length - max(places), 0.0))
         vehicle.set("departPos", f"{at + metres:.3f}")
+        for stop, key, place in stops:
+            stop.set(key, f"{place + metres + (offset if place < 0.0 else 0.0):.3f}")
+
+    @staticmethod
+    def _stops(vehicle: ET.Element, edge: str | None) -> list[tuple[ET.Element, str, float]]:
+        """Where a vehicle stops on an edge: the stop, which end of it, and its place."""
+        found = []
         for stop in vehicle.iter("stop"):
             on = stop.get("edge") or stop.get("lane", "").rpartition("_")[0]
-            if edge is not None and on != edge:
-                continue
             for key in ("startPos", "endPos"):
                 place = number(stop.get(key))
-                if place is not None:
-                    stop.set(key, f"{place + metres + (offset if place < 0.0 else 0.0):.3f}")
+                if place is not None and (edge is None or on == edge):
+                    found.append((stop, key, place))
+        return found
 
 
 def _edges(element: ET.Element) -> list[str]:
@@ -180,7 +188,7 @@ def randomize(
     )
     choice = rng.random(len(others))
 
-    ahead = leads(humans, starts, ego) if spacing else []
+    ahead = leads(humans[: int(count)], starts, ego) if spacing else []
     spaced, human = set(ahead), set(humans)
     for i, vehicle in enumerate(others):
         if vehicle not in spaced:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -38,11 +39,10 @@ def same(a: Rollout, b: Rollout) -> None:
 
 def test_stepped_from_outside_it_is_the_run_again_and_again() -> None:
     setup, expected = setup_of(), run("stalled", "cohesive", 3, overrides=SHORT)
-    recorders = []
-    with Episode(setup) as episode:
+    recorder = Recorder(setup)
+    with Episode(setup, [recorder]) as episode:
+        assert not episode.truncated
         for _ in range(2):
-            recorder = Recorder(setup)
-            episode._listeners = [recorder]
             ego = PlannedCar(
                 setup.make_planner(), setup.road, new_history(setup.cohesion, STEP), setup.settings
             )
@@ -55,9 +55,8 @@ def test_stepped_from_outside_it_is_the_run_again_and_again() -> None:
             assert episode.outcome == "finished"
             assert episode.truncated
             assert not episode.terminated
-            recorders.append(recorder)
-    for recorder in recorders:
-        same(recorder.rollout(), expected)
+            for _ in range(2):
+                same(recorder.rollout(), expected)
 
 
 def test_a_control_drives_the_ego_and_none_leaves_it_to_sumo() -> None:
@@ -76,6 +75,20 @@ def test_a_control_drives_the_ego_and_none_leaves_it_to_sumo() -> None:
         assert episode.observation.ego.speed == 0.0  # and no car reverses
         with pytest.raises(SimulationError, match=r"the episode is over \(finished\)"):
             episode.step(None)
+
+
+def test_a_closed_episode_drives_nobody_elses_run() -> None:
+    with Episode(setup_of()) as first:
+        first.reset()
+    assert first.outcome == "closed"
+    assert first.truncated
+    with Episode(setup_of()) as second:
+        second.reset()
+        before = second.scene.time
+        with pytest.raises(SimulationError, match="closed"):
+            first.step(None)
+        second.step(None)
+        assert second.scene.time == pytest.approx(before + STEP)
 
 
 def test_a_collision_terminates() -> None:
@@ -163,6 +176,39 @@ def test_a_fleet_needs_a_planner_that_can_be_made_anew() -> None:
     with pytest.raises(UserError, match="give the planner's class or name"):
         run("stalled", Steady(), 3, overrides=fleet)
     assert run("stalled", Steady, 3, overrides=fleet).metrics["fleet_size"].iloc[0] > 1
+
+
+class Untold(Steady):
+    """Says nothing of itself that could be worked with."""
+
+    def plan(self, observation: Observation, history: object) -> Plan:
+        plan = super().plan(observation, history)
+        odd: dict[str, Any] = {"wall_time": None, "social_time": "", "solver": None}
+        return replace(plan, states=np.zeros((11, 2)), **odd)
+
+
+def test_what_a_planner_does_not_say_is_unknown() -> None:
+    rollout = run("stalled", Untold, 3, overrides={**SHORT, "reference": True})
+    assert rollout.timing[["social_ms", "solver_ms"]].isna().all().all()
+    assert rollout.reference["plan_lateral"].isna().all()
+    assert rollout.horizon.empty
+
+
+def test_a_comparison_loses_nothing_whatever_a_planner_does(tmp_path: Path) -> None:
+    class Leaves(Steady):
+        def plan(self, observation: Observation, history: object) -> Plan:
+            raise SystemExit(3)
+
+    out, horizon = tmp_path / "out", {**SHORT, "planner.horizon": np.int64(10)}
+    with pytest.raises(SimulationError, match=r"SystemExit: 3; finished runs are kept in") as error:
+        compare("stalled", (Steady, Leaves), (3,), overrides=horizon, out=out)
+    kept = tmp_path / "out.unfinished"
+    assert str(kept) in str(error.value)
+    assert len(list(kept.rglob("run.json"))) == 1
+    assert len(compare("stalled", (Steady,), np.arange(2), overrides=horizon, out=out).runs) == 2
+    assert (
+        run("stalled", Steady, np.int64(3), overrides=SHORT, out=tmp_path / "run").info["seed"] == 3
+    )
 
 
 def test_what_is_no_planner_is_one_line() -> None:

@@ -152,13 +152,20 @@ def test_a_failure_while_writing_leaves_nothing_behind(tmp_path: Path) -> None:
 def test_a_picture_joins_a_result_but_replaces_no_other(tmp_path: Path) -> None:
     out = tmp_path / "out"
     write(out, "run.json")
-    claim(out, "paths.png").write_text("drawn")
-    claim(out, "paths.png").write_text("drawn again")
+    for text in ("drawn", "drawn again"):
+        with claim(out, "paths.png") as path:
+            path.write_text(text)
     (out / "other.png").write_text("mine")
-    with pytest.raises(UserError, match=r"other\.png: is not of this result"):
-        claim(out, "other.png")
+    with (
+        pytest.raises(UserError, match=r"other\.png: is not of this result"),
+        claim(out, "other.png"),
+    ):
+        pass
+    with pytest.raises(KeyError), claim(out, "third.png"):
+        raise KeyError  # nothing was drawn
+    (out / "third.png").write_text("mine")
     write(out, "run.json")
-    assert files(out) == {"run.json", "other.png", MARKER}
+    assert files(out) == {"run.json", "other.png", "third.png", MARKER}
 
 
 def test_a_list_that_names_files_elsewhere_reaches_none_of_them(tmp_path: Path) -> None:
@@ -172,3 +179,54 @@ def test_a_list_that_names_files_elsewhere_reaches_none_of_them(tmp_path: Path) 
     for nonsense in ("", "[]", '{"files": 3}', '{"files": [3]}'):
         (out / MARKER).write_text(nonsense)
         assert folders._listed(out) == []
+
+
+def test_a_batch_is_never_replaced(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    write(out, "a.png")
+    (out / "manifest.json").write_text("{}")
+    with pytest.raises(UserError, match="something else"):
+        require_replaceable(out)
+
+
+def test_unfinished_work_stays_on_its_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where it cannot be moved beside the folder, as from another disk, it is kept within."""
+    out = tmp_path / "out"
+    out.mkdir()
+    real = Path.rename
+
+    def rename(self: Path, target: Path) -> Path:
+        if Path(target).parent != out:
+            raise OSError(18, "Invalid cross-device link")
+        return real(self, target)
+
+    monkeypatch.setattr(Path, "rename", rename)
+    for expected in ("unfinished", "unfinished-2"):
+        with pytest.raises(KeyError), whole_folder(out) as new:  # noqa: PT012
+            (new / "run.json").write_text("done")
+            assert keep(new, out) == out / expected
+            raise KeyError
+    assert files(out) == {"unfinished/run.json", "unfinished-2/run.json"}
+
+
+@pytest.mark.parametrize("nth", range(6))
+def test_ctrl_c_while_files_are_moved_leaves_the_old_result_whole(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, nth: int
+) -> None:
+    out = tmp_path / "out"
+    write(out, "a", "b", text="old")
+    real, calls = Path.rename, iter(range(100))
+
+    def rename(self: Path, target: Path) -> Path:
+        if next(calls) == nth:
+            raise KeyboardInterrupt
+        return real(self, target)
+
+    monkeypatch.setattr(Path, "rename", rename)
+    with pytest.raises(KeyboardInterrupt):
+        write(out, "a", "c")
+    monkeypatch.undo()
+    assert {name: (out / name).read_text() for name in ("a", "b")} == {"a": "old", "b": "old"}
+    assert (tmp_path / "out.unfinished" / "c").read_text() == "new"
+    write(out, "a")  # it is an earlier result still
+    assert files(out) == {"a", MARKER}

@@ -51,7 +51,7 @@ class Transcription:
     """Writes the instances of problems of one shape, and checks their solutions.
 
     Roads have up to ``n_lanes`` lanes. One plan after the other: writing, solving and checking
-    must not be interleaved.
+    must not be interleaved; mpc has one per thread.
     """
 
     def __init__(self, settings: PlannerSettings, n_lanes: int) -> None:
