@@ -92,6 +92,16 @@ def solvers_table(planner: pd.DataFrame, horizon: int) -> str:
     return "\n".join(lines)
 
 
+def rooms_sentence(report: str) -> str:
+    """Say what benchmarks/rooms.txt says of the cost of perception and social."""
+    (few,) = re.findall(r"median ratio of 5 seeds (\S+)", report)
+    stream = sorted(re.findall(r"^stream.*ratio (\S+)$", report, re.MULTILINE))
+    return (
+        f"In `stalled` (3 to 7 humans) they take {few} times as long as SUMO's step (median of five"
+        f" seeds),\nin a stream of traffic {stream[0]} to {stream[-1]} times."
+    )
+
+
 def pages() -> dict[Path, dict[str, str]]:
     """Tables of each page, by name."""
     solvers = pd.read_csv(BENCHMARKS / "planner.csv")
@@ -99,6 +109,7 @@ def pages() -> dict[Path, dict[str, str]]:
         EVIDENCE: {
             "claims": claims_table(pd.read_csv(HERE / "claims.csv")),
             "ablation": ablation_table(pd.read_csv(HERE / "ablation.csv")),
+            "rooms": rooms_sentence((BENCHMARKS / "rooms.txt").read_text(encoding="utf-8")),
         },
         PLANNER: {
             "horizon": horizon_table(pd.read_csv(HERE / "horizon.csv")),
