@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Self
+
 
 class UserError(Exception):
     """The user's input is wrong; the message is one line that says what and how to mend it."""
@@ -10,12 +12,8 @@ class UserError(Exception):
         super().__init__(" ".join(message.split()))
 
 
-class SimulationError(Exception):
-    """SUMO did something that would make the results untrue; the message is one line."""
-
-
-class StoppedError(UserError):
-    """SUMO stopped in the middle of a run, over something in its input that it met only then.
+class _EndedError(Exception):
+    """A run's end amid its steps.
 
     ``rollout`` is the record of the run until then (tables.rollout.Rollout), if there is any.
     """
@@ -27,11 +25,19 @@ class StoppedError(UserError):
         kept = {key: value for key, value in vars(self).items() if key != "rollout"}
         return type(self), self.args, kept
 
-    def said(self, more: str) -> StoppedError:
+    def said(self, more: str) -> Self:
         """Return the same error, with more to say."""
-        error = StoppedError(f"{self}; {more}")
+        error = type(self)(f"{self}; {more}")
         error.rollout = self.rollout
         return error
+
+
+class SimulationError(_EndedError):
+    """SUMO did something that would make the results untrue; the message is one line."""
+
+
+class StoppedError(UserError, _EndedError):
+    """SUMO stopped in the middle of a run, over something in its input that it met only then."""
 
 
 class StorageError(UserError):

@@ -228,7 +228,7 @@ class Episode:
             self._drivers.act(scene.time, self._sumo, others)
             self._sumo.step(ego, others)
             following = self._sumo.read()
-        except StoppedError:
+        except (StoppedError, SimulationError):
             self._finish(scene, STOPPED, ())
             raise
         seconds = Seconds(

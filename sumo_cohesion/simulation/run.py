@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import ParseError
 
-from sumo_cohesion.errors import StoppedError
+from sumo_cohesion.errors import SimulationError, StoppedError
 from sumo_cohesion.planning.registry import AnyPlanner
 from sumo_cohesion.simulation.car import PlannedCar
 from sumo_cohesion.simulation.episode import Episode, Listener
@@ -61,7 +61,7 @@ def run(
         If the input is wrong. Where SUMO found it in the middle of the run, what was recorded
         until then is in ``out``.
     SimulationError
-        If the simulation cannot be trusted.
+        If the simulation cannot be trusted; likewise.
     """
     folder = None if out is None else Path(out)
     if folder is not None:  # before the drive, not after
@@ -87,7 +87,7 @@ def record(
             rollout = simulate(
                 setup, sumo_outputs=sumo_outputs, gui=gui, listeners=listeners, outputs=users
             )
-        except StoppedError as error:
+        except (StoppedError, SimulationError) as error:
             if not isinstance(error.rollout, Rollout):
                 raise
             error.rollout.write(folder, users)
@@ -115,7 +115,7 @@ def simulate(
         asking = replace(setup, outputs=asked)
         try:
             rollout = drive(asking, gui=gui, listeners=listeners, outputs=outputs)
-        except StoppedError as error:
+        except (StoppedError, SimulationError) as error:
             if isinstance(error.rollout, Rollout):
                 with suppress(ParseError):  # SUMO may not have come to its end
                     error.rollout = replace(error.rollout, sumo=asked.read())
@@ -142,7 +142,7 @@ def drive(
             while not episode.outcome:
                 plan = ego.step(observation)
                 observation = episode.step(plan, ego.spent)
-        except StoppedError as error:
+        except (StoppedError, SimulationError) as error:
             error.rollout = recorder.rollout() if recorder.heard else None
             raise
     return recorder.rollout()

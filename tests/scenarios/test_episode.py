@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,8 @@ from sumo_cohesion.simulation.request import RunRequest
 from sumo_cohesion.simulation.setup import Setup, prepare
 from sumo_cohesion.social.memory import new_history
 from sumo_cohesion.social.settings import CohesionSettings
-from sumo_cohesion.state import STEP, Control, Observation, Plan
+from sumo_cohesion.state import STEP, Control, Observation, Plan, Scene
+from sumo_cohesion.traffic.simulator import Simulator
 from tests.conftest import ROOT
 
 SHORT = {"duration": 2.0}
@@ -282,3 +284,23 @@ def test_a_comparison_that_sumo_stops_says_where_everything_is(late_mistake: Pat
     kept = late_mistake.parent / "out.unfinished" / "nominal" / "seed_0003"
     assert f"what was recorded until then is in {kept}" in str(error.value)
     assert Rollout.read(kept).info["outcome"] == "stopped"
+
+
+def test_a_run_that_cannot_be_trusted_keeps_what_came_before(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As where a calibrator takes the ego out of the simulation."""
+    real, reads = Simulator.read, iter(range(100))
+
+    def read(self: Simulator) -> Scene:
+        if next(reads) == 6:
+            raise SimulationError("SUMO has removed the ego")
+        return real(self)
+
+    monkeypatch.setattr(Simulator, "read", read)
+    with pytest.raises(SimulationError, match="recorded until then is in") as error:
+        run("stalled", "nominal", 3, overrides=SHORT, out=tmp_path / "out")
+    assert len(Rollout.read(tmp_path / "out").plan) == 5
+    sent = pickle.loads(pickle.dumps(error.value))
+    assert str(sent) == str(error.value)
+    assert sent.rollout is None
