@@ -141,17 +141,36 @@ def _check_junctions(net: ET.Element, edges: _Edges) -> None:
             if abs(_number(of, key, _need(junction, key))) >= FARTHEST:
                 raise _NonsenseError(f"{of}: {key} is farther than {FARTHEST:g} m")
         _check_shape(of, junction.get("shape", ""))
-        for key in ("incLanes", "intLanes"):
-            for lane in junction.get(key, "").split():
-                if lane not in edges.lanes:
-                    raise _NonsenseError(f"{of}: {key} names lane {lane!r}, which is not there")
-        _check_requests(of, junction.findall("request"))
     for ends in (edges.start, edges.end):
         for edge, junction_name in ends.items():
             if junction_name not in names:
                 raise _NonsenseError(
                     f"edge {edge!r} names junction {junction_name!r}, which is not there"
                 )
+    for junction in net.findall("junction"):
+        _check_lists(junction, edges)
+
+
+def _check_lists(junction: ET.Element, edges: _Edges) -> None:
+    """Check what a junction says of the lanes that lead to it and of those within it."""
+    name = junction.get("id", "")
+    of = f"junction {name!r}"
+    for key in ("incLanes", "intLanes"):
+        for lane in junction.get(key, "").split():
+            if lane not in edges.lanes:
+                raise _NonsenseError(f"{of}: {key} names lane {lane!r}, which is not there")
+            if _node(lane) != _node(name) and edges.end.get(_edge_of(lane)) != _node(name):
+                raise _NonsenseError(f"{of}: {key} names lane {lane!r} of another junction")
+    _check_requests(of, junction.findall("request"))
+
+
+def _edge_of(lane: str) -> str:
+    return lane.rpartition("_")[0]
+
+
+def _node(name: str) -> str:
+    """Junction that a lane within one, or a junction within one, is part of; else the name."""
+    return name[1:].rsplit("_", 2)[0] if name.startswith(":") else name
 
 
 def _check_requests(of: str, requests: list[ET.Element]) -> None:

@@ -108,6 +108,8 @@ OUT = r'    <connection from=":n1_0" [^\n]*\n'
         (r'(<junction id="n1"[^>]*) x="[^"]*"', r'\1 x="inf"', ["junction 'n1'", "x = 'inf'"]),
         (r'(<junction id="n1"[^>]*) y="[^"]*"', r'\1 y="1e20"', ["junction 'n1'", "farther"]),
         (r'(<junction id="n1".*?incLanes=")[^"]*"', r'\1a_0"', ["incLanes", "'a_0'"]),
+        (r'(<junction id="n1".*?incLanes=")[^"]*"', r'\1bend_1_0"', ["incLanes", "of another"]),
+        (r'(<junction id="n1".*?intLanes=")[^"]*"', r'\1:n2_0_0"', ["intLanes", "of another"]),
         (r'(<junction id="n1".*?foes=")', r"\1 0", ["junction 'n1'", "foes = ' 0"]),
         (r'(<junction id="n1".*?response=")[^"]*', r"\1", ["no response"]),
         (r'(<junction id="n1".*?<request index=")0', r"\g<1>5", ["request 0", "the index '5'"]),
