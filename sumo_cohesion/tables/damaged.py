@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,7 +18,9 @@ def tables_of(folder: Path) -> Iterator[None]:
     column without values or rows of another run, ends here.
     """
     try:
-        yield
+        with warnings.catch_warnings():  # what NumPy says of such values is no help
+            warnings.simplefilter("ignore", RuntimeWarning)
+            yield
     except (UserError, SimulationError):
         raise
     except Exception as error:

@@ -17,6 +17,8 @@ from sumo_cohesion.batches import workers
 from sumo_cohesion.batches.workers import CallFailedError
 from tests.conftest import ROOT
 
+pytestmark = pytest.mark.slow
+
 FAULTY = "tests.scenarios.faulty_planners:"
 SHORT = ("--set", "duration=2.0")
 

@@ -27,6 +27,8 @@ from sumo_cohesion.state import STEP, Control, Observation, Plan, Scene
 from sumo_cohesion.traffic.simulator import Simulator
 from tests.conftest import ROOT
 
+pytestmark = pytest.mark.slow
+
 SHORT = {"duration": 2.0}
 
 

@@ -22,6 +22,8 @@ from sumo_cohesion.tables.folders import MARKER
 from sumo_cohesion.traffic.simulator import Simulator
 from tests.conftest import ROOT
 
+pytestmark = pytest.mark.slow
+
 WAY = '<route id="r" edges="west east"/>'
 HUMAN = "<vType id='h' laneChangeModel='SL2015' speedFactor='0.8' speedDev='0'/>"
 LEAD = (

@@ -17,6 +17,8 @@ import pytest
 from sumo_cohesion.batches.workers import NO_LIMITS, CallFailedError, Limits, Workers
 from tests.conftest import ROOT
 
+pytestmark = pytest.mark.slow
+
 TASKS = "tests.scenarios.faulty_tasks:"
 
 needs_proc = pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="needs Linux")

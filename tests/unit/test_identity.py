@@ -118,6 +118,7 @@ CANNOT_CHANGE_A_ROW = ("planning/landscape.py", "tables/rollout.py", "tables/fol
 """Loaded, but pictures are drawn by the first, and the others say how a record is kept."""
 
 
+@pytest.mark.slow
 def test_every_file_that_a_run_loads_counts(copied: Path, loaded_by_a_run: list[str]) -> None:
     assert len(loaded_by_a_run) > 50
     before = digest_of_code()
@@ -135,6 +136,7 @@ def test_every_file_that_a_run_loads_counts(copied: Path, loaded_by_a_run: list[
     assert digest_of_code() == before
 
 
+@pytest.mark.slow
 def test_what_code_does_counts_and_what_is_said_of_it_does_not(copied: Path) -> None:
     before = digest_of_code()
     path = copied / "social" / "election.py"

@@ -45,6 +45,7 @@ print(len(wrong), sum(wrong))
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("how", ["compiled", "0"])
 def test_two_planners_in_two_threads_plan_as_each_would_alone(how: str) -> None:
     if how == "compiled" and compiled.find_compiler() is None:
