@@ -53,6 +53,7 @@ def test_a_scenario_is_not_an_experiment(invoke: Invoke) -> None:
         assert_one_line(result, "is an experiment", "sumo-cohesion batch beta.toml")
 
 
+@pytest.mark.slow
 def test_a_figure_of_what_is_no_run_says_what_is_there(invoke: Invoke) -> None:
     assert_one_line(invoke("figure", "nothere"), "nothere: no such folder")
     assert_one_line(invoke("figure", "."), "no run there")
@@ -72,6 +73,7 @@ def test_the_help_that_is_named_is_the_commands_own(invoke: Invoke) -> None:
     assert_one_line(invoke("flyy"), "(sumo-cohesion --help)")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", [["run"], ["compare", "--seeds", "0:2"]])
 def test_a_planner_that_raises_in_reset_is_one_line_or_all_of_it(
     invoke: Invoke,
@@ -96,6 +98,7 @@ def test_a_mistake_of_ours_has_nothing_to_trace(invoke: Invoke) -> None:
         assert "--traceback" not in result[2]
 
 
+@pytest.mark.slow
 def test_one_number_of_seeds_is_told_to_be_one_seed(invoke: Invoke) -> None:
     asked = ("compare", "stalled", "--planners", "sumo", *SHORT, "--seeds")
     status, _, err = invoke(*asked, "3")
@@ -109,6 +112,7 @@ def test_what_is_said_where_there_is_no_terminal_is_said_in_lines(invoke: Invoke
     assert_one_line(result)  # no bar, no empty line before it
 
 
+@pytest.mark.slow
 def test_a_dry_run_counts_and_an_estimate_measures(invoke: Invoke) -> None:
     Path("e.toml").write_text(EXPERIMENT + "[set]\nduration = 1.0\n")
     status, out, _ = invoke("batch", "e.toml", "--dry-run")
@@ -120,6 +124,7 @@ def test_a_dry_run_counts_and_an_estimate_measures(invoke: Invoke) -> None:
     assert not Path("results").exists()
 
 
+@pytest.mark.slow
 def test_sumos_own_outputs_of_one_run(invoke: Invoke) -> None:
     assert get_args(Output) == SUMO_OUTPUTS
     assert_one_line(invoke("run", "stalled", "--sumo-outputs", "fdc"), "did you mean 'fcd'")

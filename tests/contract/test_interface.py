@@ -28,6 +28,7 @@ def compared(tmp_path_factory: pytest.TempPathFactory) -> sc.Comparison:
     return sc.compare("stalled", "nominal,sumo", "0:1", overrides=BRIEF, out=out, workers=1)
 
 
+@pytest.mark.slow
 def test_a_run_and_a_comparison_say_themselves_in_a_line(compared: sc.Comparison) -> None:
     assert compared.folder is not None
     rollout = sc.load_rollout(str(compared.folder / "sumo" / "seed_0000"))
@@ -123,6 +124,7 @@ def test_looking_for_repeats_is_no_work_for_many_seeds(monkeypatch: pytest.Monke
     assert compared < 10_000
 
 
+@pytest.mark.slow
 def test_a_planner_that_raises_in_reset_keeps_its_own_exception(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -151,6 +151,7 @@ def test_what_code_does_counts_and_what_is_said_of_it_does_not(copied: Path) -> 
         assert digest_of_code() != before, change
 
 
+@pytest.mark.slow
 def test_what_only_looks_at_results_does_not_count(copied: Path) -> None:
     before = digest_of_code()
     for name in ("cli/running.py", "__main__.py", "report/paper.py", "batches/store.py"):
