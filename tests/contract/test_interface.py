@@ -61,6 +61,7 @@ def test_a_long_name_does_not_make_a_long_line() -> None:
     assert len(repr(sc.Comparison(runs, runs, None))) < 600
 
 
+@pytest.mark.slow
 def test_a_folder_is_read_by_its_name(compared: sc.Comparison) -> None:
     folder = str(compared.folder)
     assert sc.Rollout.read(f"{folder}/sumo/seed_0000").info["planner"] == "sumo"

@@ -133,6 +133,7 @@ def test_scenario_files(
     assert_one_line(invoke("run", path), *needles)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "text", "needles"),
     [

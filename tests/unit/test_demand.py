@@ -289,6 +289,7 @@ def test_an_unknown_distribution_is_a_clear_error(build: Build) -> None:
         factors(build, '<vType id="h" speedFactor="uniform(1,2)"/>', "h")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "mix",
     [

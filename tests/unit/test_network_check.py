@@ -43,6 +43,7 @@ def test_networks_of_ours_are_sound(path: Path) -> None:
     check_network(ET.parse(path).getroot(), path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "options",
     [
@@ -126,6 +127,7 @@ def test_nonsense_is_one_line(pattern: str, new: str, needles: list[str], tmp_pa
         assert needle in str(error.value)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("pattern", "new", "needles"),
     [

@@ -219,6 +219,7 @@ def test_the_box_problem_is_solved_exactly() -> None:
         assert value(step) <= value(grid).min() + 1e-12
 
 
+@pytest.mark.slow
 def test_bounds_hold_whatever_is_asked(solvers: dict[str, Mpc]) -> None:
     solved: list[bool] = []
 
