@@ -7,7 +7,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -16,6 +15,7 @@ from sumo_cohesion import Rollout, cli
 from sumo_cohesion.batches import workers
 from sumo_cohesion.batches.workers import CallFailedError
 from tests.conftest import ROOT
+from tests.waiting import wait_for
 
 pytestmark = pytest.mark.slow
 
@@ -136,9 +136,7 @@ def test_an_interrupt_ends_the_drive(tmp_path: Path) -> None:
         # Tests that run in the background of a shell inherit that Ctrl-C is ignored.
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
-    while not pid.exists():
-        assert process.poll() is None
-        time.sleep(0.05)
+    wait_for(pid.exists, process, "the drive")
     process.send_signal(signal.SIGINT)
     said = process.communicate()[1]
     assert process.returncode == 1

@@ -8,14 +8,13 @@ import signal
 import subprocess
 import sys
 import threading
-import time
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from sumo_cohesion.batches.workers import NO_LIMITS, CallFailedError, Limits, Workers
 from tests.conftest import ROOT
+from tests.waiting import HANGS, wait_for
 
 pytestmark = pytest.mark.slow
 
@@ -32,15 +31,6 @@ def is_running(pid: int) -> bool:
     return state != "Z"
 
 
-def wait_for(event: Callable[[], object], what: str) -> None:
-    """Wait as long as any machine may need."""
-    for _ in range(3000):
-        if event():
-            return
-        time.sleep(0.1)
-    pytest.fail(f"{what} did not happen")
-
-
 def failure_of(workers: Workers, *arguments: object) -> CallFailedError:
     """Make a call that must fail, in a thread: a call that never returns fails the test."""
     failures: list[CallFailedError] = []
@@ -53,7 +43,7 @@ def failure_of(workers: Workers, *arguments: object) -> CallFailedError:
 
     thread = threading.Thread(target=call, daemon=True)
     thread.start()
-    thread.join(timeout=120)
+    thread.join(timeout=HANGS)
     assert failures, "the call has not come back"
     return failures[0]
 
@@ -69,7 +59,7 @@ def test_a_time_limit_ends_what_the_call_has_forked_and_does_not_wait_for_it(
         if child.exists():
             break
     pid = int(child.read_text())
-    wait_for(lambda: not is_running(pid), "the end of the forked child")
+    wait_for(lambda: not is_running(pid), what="the end of the forked child")
     workers.close()
 
 
@@ -81,7 +71,7 @@ def test_a_crash_ends_what_the_call_has_forked_and_does_not_wait_for_it(tmp_path
     assert failure.kind == "crash"
     assert "SIGSEGV" in failure.reason
     pid = int(child.read_text())
-    wait_for(lambda: not is_running(pid), "the end of the forked child")
+    wait_for(lambda: not is_running(pid), what="the end of the forked child")
     workers.close()
 
 
@@ -93,11 +83,11 @@ def test_what_a_call_has_forked_ends_when_the_parent_is_killed(tmp_path: Path) -
         f"Workers({TASKS + 'fork_and_wait'!r}, NO_LIMITS).call({str(child)!r})\n"
     )
     parent = subprocess.Popen([sys.executable, "-c", code], cwd=ROOT)
-    wait_for(child.exists, "the fork")
+    wait_for(child.exists, what="the fork")
     parent.send_signal(signal.SIGKILL)
     parent.wait()
     pid = int(child.read_text())
-    wait_for(lambda: not is_running(pid), "the end of the forked child")
+    wait_for(lambda: not is_running(pid), what="the end of the forked child")
 
 
 def test_a_run_cannot_read_the_calls() -> None:
@@ -105,7 +95,7 @@ def test_a_run_cannot_read_the_calls() -> None:
     done: list[str] = []
     thread = threading.Thread(target=lambda: done.append(workers.call()), daemon=True)
     thread.start()
-    thread.join(timeout=120)
+    thread.join(timeout=HANGS)
     assert done == [""]
     workers.close()
 
