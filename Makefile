@@ -16,7 +16,7 @@ test: $(VENV)/.installed
 
 # What is quick enough for every save: half a minute.
 test-quick: $(VENV)/.installed
-	$(BIN)/python -m pytest -q -m "not slow"
+	HYPOTHESIS_PROFILE=quick $(BIN)/python -m pytest -q -m "not slow"
 
 lint: $(VENV)/.installed
 	$(BIN)/ruff format --check .

@@ -19,6 +19,7 @@ from sumo_cohesion.traffic.network import Network
 # A busy machine is no failure.
 _ANY_MACHINE = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.register_profile("any_machine", _ANY_MACHINE)
+settings.register_profile("quick", _ANY_MACHINE, max_examples=20)
 settings.register_profile("thorough", _ANY_MACHINE, max_examples=2500)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "any_machine"))
 

@@ -15,6 +15,7 @@ RUNS = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("scenario", "planner"), RUNS)
 def test_runs(scenario: str, planner: str) -> None:
     rollout = drive(scenario, planner)

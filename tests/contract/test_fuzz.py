@@ -57,7 +57,7 @@ def _raises() -> None:
         (lambda: sys.exit(2), "UNCLEAR"),
         (_raises, "TRACEBACK"),
         (lambda: os.kill(os.getpid(), signal.SIGKILL), "DEAD"),
-        (signal.pause, "HANGS"),
+        pytest.param(signal.pause, "HANGS", marks=pytest.mark.slow),
     ],
     ids=["done", "one line", "two lines", "status 1", "nothing said", "raises", "dies", "hangs"],
 )

@@ -234,6 +234,7 @@ class InTheMiddle:
         return Plan((Control(0.0, 0.1 * observation.ego.speed),), [], "straight on")
 
 
+@pytest.mark.slow
 def test_two_threads_never_share_a_simulation() -> None:
     """One of them gets its own run, whole; the other is told."""
 

@@ -114,6 +114,7 @@ def test_a_run_ends_when_the_ego_has_left_its_route_and_every_lane_off_it(
     assert rollout.trajectory["time"].max() < 45.0
 
 
+@pytest.mark.slow
 def test_what_a_road_cannot_be_told_of_or_driven_along_says_so(tmp_path: Path, city: Path) -> None:
     path = scenario(tmp_path, city, "A1A0", 0)  # back the same way: a U-turn
     for planner in ("nominal", "sumo"):

@@ -80,7 +80,7 @@ def clipped_area(subject: list[tuple[float, float]], clip: list[tuple[float, flo
     )
 
 
-@settings(max_examples=500)
+@settings(max_examples=settings().max_examples * 5)
 @given(
     x=st.floats(-6, 6),
     y=st.floats(-6, 6),
