@@ -278,6 +278,7 @@ def test_a_vehicle_of_infinite_size(
     assert_one_line(invoke("run", path, "--planner", "sumo"), "'odd'", "inf m", "mend its type")
 
 
+@pytest.mark.slow
 def test_damaged_results_say_so(invoke: Invoke) -> None:
     import pandas as pd
 

@@ -159,12 +159,14 @@ def test_what_only_looks_at_results_does_not_count(copied: Path) -> None:
         assert digest_of_code() == before, name
 
 
+@pytest.mark.slow
 def test_a_files_name_counts(copied: Path) -> None:
     before = digest_of_code()
     (copied / "road.py").rename(copied / "roads.py")
     assert digest_of_code() != before
 
 
+@pytest.mark.slow
 def test_versions_count(monkeypatch: pytest.MonkeyPatch) -> None:
     before = digest_of_code()
     monkeypatch.setattr(identity, "versions", lambda: {"libsumo": "0.0"})

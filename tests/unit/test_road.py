@@ -137,6 +137,7 @@ def test_a_way_through_a_city_has_few_columns_of_lanes(
     assert np.isnan(many[:, few.shape[1] :]).all()
 
 
+@pytest.mark.slow
 def test_where_a_road_turns_too_sharply(curve: Road, city: Path) -> None:
     # The curve's radius is 505 m, from 100 m on.
     assert curve.too_sharp(1 / 490, 0.0, curve.length) is None
@@ -154,6 +155,7 @@ def test_where_a_road_turns_too_sharply(curve: Road, city: Path) -> None:
     assert straight.too_sharp(0.001, 0.0, straight.length) is None
 
 
+@pytest.mark.slow
 def test_where_a_road_comes_back_to_itself(highway: Road, curve: Road, city: Path) -> None:
     for road in (highway, curve):
         assert road.returns(0.0, road.length) is None
@@ -171,6 +173,7 @@ def test_where_a_road_comes_back_to_itself(highway: Road, curve: Road, city: Pat
     assert again.returns(around.length / 2, around.length / 2 + 20.0) is None
 
 
+@pytest.mark.slow
 def test_a_point_is_projected_on_the_stretch_that_it_is_beside(city: Path) -> None:
     """Also where another stretch passes nearby, or an extension of the line beyond its end."""
     streets = Network(city)
