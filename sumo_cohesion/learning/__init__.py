@@ -1,0 +1,1 @@
+"""Learn the reward weights theta from driving, by continuous inverse optimal control."""
