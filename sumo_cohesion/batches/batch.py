@@ -103,6 +103,7 @@ def batch(
             _check(todo)
         about = {
             "experiment": asked.model_dump(mode="json"),
+            "folder": str(asked.folder),
             "grid": list(asked.grid),
             "versions": versions(),
         }

@@ -137,6 +137,11 @@ class Experiment(BaseModel):
             )
         return self
 
+    @property
+    def folder(self) -> Path:
+        """Where its scenarios' files are looked up."""
+        return self._folder.resolve()
+
     def points(self) -> Iterator[Point]:
         """Every scenario, planner and grid point, in the order of the file."""
         both = set(self.set) & set(self.grid)
@@ -201,6 +206,13 @@ def load_experiment(source: str | Path | Mapping[str, Any]) -> Experiment:
     experiment = validated(Experiment, data, str(path))
     experiment._folder = path.parent.resolve()
     experiment._source = str(path)
+    return experiment
+
+
+def stored_experiment(data: Mapping[str, Any], folder: Path) -> Experiment:
+    """Return the experiment that a batch's manifest holds, and where its files are looked up."""
+    experiment = validated(Experiment, dict(data), "experiment")
+    experiment._folder = folder
     return experiment
 
 

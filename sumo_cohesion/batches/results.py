@@ -40,7 +40,7 @@ def load_metrics(folder: str | Path) -> pd.DataFrame:
         return joined(root)
     if (root / "metrics.parquet").is_file():
         return read_parquet(root / "metrics.parquet")
-    parts = [run / "metrics.parquet" for run in _run_folders(root)]
+    parts = [run / "metrics.parquet" for run in run_folders(root)]
     return pd.concat([read_parquet(part) for part in parts], ignore_index=True)
 
 
@@ -54,7 +54,7 @@ def load_rollout(folder: str | Path) -> Rollout:
     """
     root = Path(folder)
     if not (root / RUN_FILE).is_file():
-        below = _run_folders(root)
+        below = run_folders(root)
         raise UserError(f"{root}: holds {_counted(below)} below; name one, e.g. {below[0]}")
     return Rollout.read(root)
 
@@ -134,7 +134,7 @@ def with_nominal_deviation(metrics: pd.DataFrame, folder: str | Path) -> pd.Data
     return filled
 
 
-def _run_folders(root: Path) -> list[Path]:
+def run_folders(root: Path) -> list[Path]:
     if not root.is_dir():
         raise UserError(f"{root}: no such folder, so no runs there; give one written by --out")
     found = sorted(path.parent for path in root.rglob(RUN_FILE))
@@ -147,7 +147,7 @@ def _run_folders(root: Path) -> list[Path]:
 
 def _runs_below(root: Path) -> pd.DataFrame:
     rows = []
-    for folder in _run_folders(root):
+    for folder in run_folders(root):
         try:
             info = json.loads((folder / RUN_FILE).read_text(encoding="utf-8"))
         except (OSError, ValueError) as error:

@@ -20,11 +20,10 @@ class Example(NamedTuple):
     ego, ego_size : where it began; length, width (m).
     cars : (n, 7) the others then, as in planning.problem.Problem, nearest first.
     driven : the control before; None if there was none to differ from.
-    controls : (T, 2) curvature (1/m) and acceleration (m/s², before friction).
-    states : (T, 4) s, d (m), heading (rad), speed (m/s) that they led to.
+    states : (T, 4) s, d (m), heading (rad), speed (m/s) that it came to.
     desired_speed : m/s that the car would like to drive; None is the limit.
     bounded : it kept to the planner's bounds, and may have been held by them.
-    moved_by : metres that smoothing moved it at most.
+    unusable : why nothing can be learned from it; "" if something can.
     """
 
     run: str
@@ -35,8 +34,7 @@ class Example(NamedTuple):
     ego_size: tuple[float, float]
     cars: FloatArray
     driven: Control | None
-    controls: FloatArray
     states: FloatArray
     desired_speed: float | None = None
     bounded: bool = False
-    moved_by: float = 0.0
+    unusable: str = ""

@@ -106,6 +106,8 @@ class Recorder:
             "special": list(setup.scenario.sensing.special),
             "features": {**dict(zip(FEATURES, LATERAL, strict=True)), "place": True},
             "solver": str(self._plans[0][2].solver),
+            "network": str(setup.network),
+            "route": list(setup.route),
             "n_route_lanes": setup.road.n_route_lanes,
             "traffic_lights": list(setup.traffic_lights),
             "notes": list(setup.notes),

@@ -105,7 +105,7 @@ class Setup(Inputs):
 
     def road_along(self, route: Sequence[str]) -> Road:
         """Road along any route of this network; raises UserError if no car can drive along it."""
-        return _road(self.network, *_version(self.network), tuple(route))
+        return road_of(self.network, route)
 
     def write_inputs(self, folder: Path, gui: bool = False, *, portable: bool = False) -> SumoRun:
         """Write this seed's demand and return what SUMO needs.
@@ -192,6 +192,13 @@ def prepare(request: RunRequest) -> Setup:
         traffic_lights=tuple(network.traffic_lights(route)),
         notes=notes,
     )
+
+
+def road_of(network: Path, route: Sequence[str]) -> Road:
+    """Road along a route of a network file, read once; raises UserError if there is none."""
+    if not network.is_file():
+        raise UserError(f"{network}: the network is no longer there")
+    return _road(network, *_version(network), tuple(route))
 
 
 def _seed(given: object) -> int:

@@ -1,0 +1,195 @@
+"""Runs and batches as demonstrations: their tables, the road they drove along, their settings."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from sumo_cohesion.batches.experiment import stored_experiment
+from sumo_cohesion.batches.results import run_folders
+from sumo_cohesion.batches.store import (
+    as_cell,
+    is_batch,
+    manifest,
+    read_parquet,
+    table_file,
+    wanted,
+)
+from sumo_cohesion.demonstrations.plans import plans
+from sumo_cohesion.errors import UserError
+from sumo_cohesion.learning.example import Example
+from sumo_cohesion.learning.recording import COLUMNS, Recording
+from sumo_cohesion.learning.source import Kind
+from sumo_cohesion.learning.tracks import Cutting, cut
+from sumo_cohesion.planning.settings import PlannerSettings
+from sumo_cohesion.road import Road
+from sumo_cohesion.simulation.setup import prepare, road_of
+from sumo_cohesion.state import EGO, STEP
+from sumo_cohesion.tables.rollout import RUN_FILE
+from sumo_cohesion.user_input import validated
+
+_SAME_PLACE = 0.01
+"""Metres within which a place must be where the run recorded it, if the network is the same."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """One run's tables; they are read when they are asked for.
+
+    ``special`` vehicles do not drive as humans do: those that the scenario hides or calls special.
+    """
+
+    name: str
+    road: Road
+    settings: PlannerSettings
+    planner: str
+    special: frozenset[str]
+    table: Callable[[str], pd.DataFrame]
+
+    def source(self, kind: Kind) -> PlansOf | TracksOf:
+        """Return the driving that is asked for."""
+        return PlansOf(self) if kind == "plans" else TracksOf(self, kind)
+
+    def trajectory(self) -> pd.DataFrame:
+        """Return the run's trajectories, if they are those of this road."""
+        table = self.table("trajectory")
+        some = table.iloc[:: max(len(table) // 50, 1)]
+        frenet, _ = self.road.to_frenet(some[["x", "y", "heading", "speed"]].to_numpy(float))
+        off = np.abs(frenet[:, :2] - some[["s", "d"]].to_numpy(float)).max(initial=0.0)
+        if not off < _SAME_PLACE:
+            raise UserError(
+                f"{self.name}: its network has changed since it was run: places differ by "
+                f"{off:.2g} m; run it again"
+            )
+        return table
+
+
+@dataclass(frozen=True)
+class PlansOf:
+    """A run whose plans demonstrate."""
+
+    run: Run
+
+    @property
+    def name(self) -> str:
+        """Of the run."""
+        return self.run.name
+
+    def examples(self, how: Cutting) -> Sequence[Example]:
+        """Take every plan that is half its own length after the one before."""
+        run, steps = self.run, self.run.settings.horizon
+        tables = run.table("plan"), run.table("horizon")
+        if not len(tables[1]):
+            raise UserError(
+                f"{run.name}: planner {run.planner} left no plans, only controls; learn from what "
+                "it drove: --from driven"
+            )
+        if steps != how.steps:
+            raise UserError(
+                f"{run.name}: its plans are {steps} steps long; plans cannot be cut to "
+                f"--steps {how.steps}, learn from what was driven: --from driven"
+            )
+        return plans(run.name, run.road, run.trajectory(), *tables, max(steps // 2, 1))
+
+
+@dataclass(frozen=True)
+class TracksOf:
+    """A run whose ego demonstrates by what it drove, or the humans around it."""
+
+    run: Run
+    kind: Kind
+
+    @property
+    def name(self) -> str:
+        """Of the run."""
+        return self.run.name
+
+    def examples(self, how: Cutting) -> Sequence[Example]:
+        """Cut the vehicles' tracks."""
+        trajectory = self.run.trajectory()
+        if self.kind == "driven":
+            vehicles = {EGO}
+        else:
+            planned = set(trajectory.loc[trajectory["planned"], "vehicle"])
+            vehicles = set(trajectory["vehicle"]) - planned - self.run.special
+            if self.run.planner != "sumo":
+                vehicles -= {EGO}
+        ordered = trajectory.sort_values(["vehicle", "time"], kind="stable")
+        table = ordered[list(COLUMNS)].reset_index(drop=True)
+        roads = dict.fromkeys(sorted(vehicles), self.run.road)
+        return cut(Recording(self.run.name, table, roads, STEP), how)
+
+
+def runs_in(folder: Path) -> list[Run]:
+    """All runs in the folder of a run, a comparison or a batch, or below it.
+
+    Raises
+    ------
+    UserError
+        If there are none, or one of them is not whole.
+    """
+    if is_batch(folder):
+        return _of_batch(folder)
+    return [_of_folder(path, folder) for path in run_folders(folder)]
+
+
+def _of_folder(path: Path, root: Path) -> Run:
+    try:
+        info = json.loads((path / RUN_FILE).read_text(encoding="utf-8"))
+        network, route = Path(info["network"]), info["route"]
+        planner, settings = info["planner"], info["settings"]
+        special = frozenset([*info["hidden"], *info["special"]])
+        settings = validated(PlannerSettings, settings, f"{path / RUN_FILE}: settings")
+        name = f"{root.name}/{path.relative_to(root).as_posix()}" if path != root else root.name
+        road = road_of(network, route)
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise UserError(
+            f"{path}: not a run that can be learned from ({type(error).__name__}: {error}); run "
+            f"it again"
+        ) from None
+    return Run(name, road, settings, planner, special, lambda t: _parquet(path / f"{t}.parquet"))
+
+
+def _parquet(path: Path) -> pd.DataFrame:
+    if not path.is_file():
+        raise UserError(f"{path}: is missing; run it again")
+    return read_parquet(path)
+
+
+def _of_batch(folder: Path) -> list[Run]:
+    about, plan = manifest(folder), wanted(folder)
+    if "folder" not in about:
+        raise UserError(f"{folder}: does not say where its scenarios are; run the batch again")
+    experiment = stored_experiment(about["experiment"], Path(about["folder"]))
+    found = []
+    for point in experiment.points():
+        setup = prepare(point.request(int(experiment.seeds[0])))
+        rows = plan[(plan["scenario"] == setup.scenario.name) & (plan["planner"] == point.planner)]
+        for key, value in point.grid.items():
+            rows = rows[rows[key].astype(str) == str(as_cell(value))]
+        for run, seed in zip(rows["run"], rows["seed"], strict=True):
+            name = f"{folder.name}/{setup.scenario.name}/{point.planner}/{seed}"
+            special = frozenset(setup.not_human)
+            tables = _kept(folder, run)
+            found.append(Run(name, setup.road, setup.settings, point.planner, special, tables))
+    if not found:
+        raise UserError(f"{folder}: the batch has no runs; run it first")
+    return found
+
+
+def _kept(folder: Path, run: str) -> Callable[[str], pd.DataFrame]:
+    def table(name: str) -> pd.DataFrame:
+        path = table_file(folder, name, run)
+        if not path.is_file():
+            raise UserError(
+                f"{folder}: kept no table {name!r} of run {run}; an experiment keeps what is "
+                'learned from with keep = ["trajectory", "plan", "horizon"]'
+            )
+        return read_parquet(path)
+
+    return table

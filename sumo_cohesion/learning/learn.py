@@ -1,0 +1,366 @@
+"""From sources of driving to weights: cut, weigh, fit, doubt, and try on what was held out."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import pandas as pd
+
+from sumo_cohesion.errors import UserError
+from sumo_cohesion.learning.example import Example
+from sumo_cohesion.learning.fit import Fit, bootstrap, fit
+from sumo_cohesion.learning.learned import DIGITS, Learned
+from sumo_cohesion.learning.likelihood import Quadratics, quadratics
+from sumo_cohesion.learning.prediction import (
+    HORIZONS,
+    best_scale,
+    displacements,
+    likelihoods,
+    spread_out,
+)
+from sumo_cohesion.learning.segments import Segments, make_segments
+from sumo_cohesion.learning.source import Source
+from sumo_cohesion.learning.tracks import Cutting
+from sumo_cohesion.planning.reward import RewardWeights
+from sumo_cohesion.planning.settings import PlannerSettings
+from sumo_cohesion.state import STEP, BoolArray, FloatArray
+from sumo_cohesion.versions import versions
+
+Progress = Callable[[str, int, int], None]
+"""Called with (what is being done, how much of it is done, how much there is)."""
+
+FEW_SEGMENTS, FEW_RUNS = 30, 3
+MUCH_DROPPED = 0.3
+LEAST_MISFIT, MOST_MISFIT = 0.5, 2.0
+"""Between these is the median of q / f where the reward describes the driving."""
+DOWN_TO_ZERO = 0.1
+"""Share of a weight below which the lower end of its interval is as good as zero."""
+INTERVAL = (0.05, 0.95)
+LEARNED, DEFAULT = "learned", "default"
+
+
+@dataclass(frozen=True)
+class Options:
+    """How to learn.
+
+    Attributes
+    ----------
+    keep : share of the segments that the fit is made of, the rest is trimmed.
+    fixed : weights that are not learned, by name.
+    hold_out : share of the runs that the fit is tried on, by another fit without them.
+    draws : of the bootstrap over runs; 0: no intervals.
+    exact : the segments are optima as they are, without noise: plans.
+    """
+
+    keep: float = 0.85
+    fixed: Mapping[str, float] = field(default_factory=dict)
+    hold_out: float = 0.25
+    draws: int = 100
+    exact: bool = False
+
+
+@dataclass(frozen=True)
+class Material:
+    """Segments that can be learned from, and what the fit needs of them."""
+
+    segments: Segments
+    data: Quadratics
+    names: tuple[str, ...]
+    defaults: FloatArray
+
+    def where(self, chosen: BoolArray) -> Material:
+        """Return some of them."""
+        return replace(self, segments=self.segments.where(chosen), data=self.data.where(chosen))
+
+    def fit(self, options: Options, held: Mapping[str, float] | None = None) -> Fit:
+        """Fit the weights."""
+        fixed = options.fixed if held is None else held
+        return fit(self.data, self.names, self.defaults, fixed, options.keep)
+
+
+def learn_from(
+    sources: Sequence[Source],
+    how: Cutting,
+    settings: PlannerSettings,
+    options: Options,
+    about: Mapping[str, object],
+    progress: Progress | None = None,
+) -> Learned:
+    """Learn the weights of the terms that ``settings.reward`` has in use.
+
+    Raises
+    ------
+    UserError
+        If nothing can be learned from the sources; the message says why.
+    """
+    say = progress or _silent
+    settings = settings.model_copy(update={"horizon": how.steps})
+    segments, material = _material(_examples(sources, how, say), settings, say)
+    for name in options.fixed:
+        if name not in material.names:
+            known = ", ".join(material.names)
+            raise UserError(f"--fix: there is no term {name!r} in use; terms are {known}")
+    found, interval = _doubted(material, options, say)
+    table, predictions = _tried(sources, how, settings, material, found, options, say)
+    rows = _segment_table(segments, found)
+    runs = len(set(material.segments.run))
+    return Learned(
+        reward=_reward(found),
+        temperature=1.0 / found.scale,
+        weights=_weight_table(found, material.defaults, interval),
+        segments=rows,
+        fit=table,
+        predictions=predictions,
+        warnings=_warnings(rows, found, table, runs, options),
+        about={
+            **about,
+            "steps": how.steps,
+            "segments": len(segments),
+            "kept": int(found.kept.sum()),
+            "runs": runs,
+            "keep": options.keep,
+            "dropped": _counted(segments),
+            "digest": _digest(segments),
+            "versions": versions(),
+        },
+    )
+
+
+def _silent(_what: str, _done: int, _total: int) -> None:
+    pass
+
+
+def _examples(sources: Sequence[Source], how: Cutting, say: Progress) -> list[Example]:
+    found: list[Example] = []
+    for i, source in enumerate(sources):
+        found += source.examples(how)
+        say("cutting", i + 1, len(sources))
+    if not found:
+        names = ", ".join([source.name for source in sources][:3])
+        raise UserError(
+            f"no segment of {how.steps} steps of {STEP:g} s in {names}; give longer driving, or "
+            "fewer --steps"
+        )
+    return found
+
+
+def _material(
+    examples: Sequence[Example], settings: PlannerSettings, say: Progress
+) -> tuple[Segments, Material]:
+    """Return all segments, with the reason why some are dropped, and what the others are made of."""
+    say("weighing", 0, 1)
+    segments = make_segments(examples, settings)
+    usable = segments.dropped == ""
+    data = quadratics(segments.where(usable), settings)
+    penalty = np.zeros(len(segments))
+    penalty[usable] = data.penalty
+    # An active penalty has a kink: no gradient is zero there.
+    segments = segments.drop(penalty > 0.0, "too near to a car, or off the road")
+    say("weighing", 1, 1)
+    if not (segments.dropped == "").any():
+        reasons = "; ".join(f"{reason}: {count}" for reason, count in _counted(segments).items())
+        raise UserError(f"nothing can be learned from {len(segments)} segments ({reasons})")
+    names = tuple(RewardWeights.model_fields)
+    defaults = np.array([getattr(RewardWeights(), name) for name in names])
+    chosen = segments.where(segments.dropped == "")
+    return segments, Material(chosen, data.where(data.penalty <= 0.0), names, defaults)
+
+
+def _doubted(
+    material: Material, options: Options, say: Progress
+) -> tuple[Fit, tuple[FloatArray, FloatArray] | None]:
+    """Fit, and draw runs again; a weight that may as well be zero is not learned."""
+    held, why = dict(options.fixed), dict[str, str]()
+    while True:
+        found = material.fit(options, held)
+        found = replace(found, kept_default={**found.kept_default, **why})
+        if options.draws == 0 or len(set(material.segments.run)) < 2:
+            return found, None
+        fixed = {n: float(found.weights[found.names.index(n)]) for n in found.kept_default}
+        samples = bootstrap(
+            material.data,
+            material.segments.run,
+            found,
+            fixed,
+            material.defaults,
+            options.draws,
+            lambda done, total: say("drawing runs", done, total),
+        )
+        low, high = np.quantile(samples, INTERVAL, axis=0)
+        unsure = [
+            name
+            for name, bound, weight in zip(found.names, low, found.weights, strict=True)
+            if name not in found.kept_default and bound < DOWN_TO_ZERO * weight
+        ]
+        if not unsure:
+            return found, (low, high)
+        for name in unsure:
+            held[name] = float(material.defaults[found.names.index(name)])
+            why[name] = "its interval reaches down to zero"
+
+
+def _tried(
+    sources: Sequence[Source],
+    how: Cutting,
+    settings: PlannerSettings,
+    material: Material,
+    found: Fit,
+    options: Options,
+    say: Progress,
+) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Compare with simpler models on runs held out: likelihood, and where predictions lead."""
+    out = _held_out(sorted(set(material.segments.run)), options.hold_out)
+    train = ~np.isin(material.segments.run, list(out))
+    if not out or not train.any() or train.all():
+        return pd.DataFrame(columns=_FIT_COLUMNS), pd.DataFrame(columns=_PREDICTION_COLUMNS)
+    fixed = {n: float(found.weights[found.names.index(n)]) for n in found.kept_default}
+    seen = material.where(train)
+    trained = seen.fit(options, fixed)
+    default = material.defaults * best_scale(seen.data, material.defaults, options.keep)
+    told = likelihoods(
+        material.data,
+        material.segments,
+        train,
+        {LEARNED: trained.theta, DEFAULT: default},
+        options.keep,
+    )
+    # Plans end with their horizon; tracks can be followed for longer.
+    longest = how if options.exact else replace(how, steps=round(HORIZONS[-1] / STEP))
+    windows = [e for s in sources for e in s.examples(longest) if e.run in out]
+    say("predicting", 0, 1)
+    predictions = displacements(
+        spread_out(windows),
+        settings.model_copy(update={"horizon": longest.steps}),
+        {LEARNED: _reward(trained), DEFAULT: RewardWeights()},
+    )
+    say("predicting", 1, 1)
+    return _fit_table(told, predictions), predictions
+
+
+def _held_out(runs: Sequence[str], share: float) -> set[str]:
+    """Choose runs by their names, so that the same are held out wherever the folder lies."""
+    count = round(share * len(runs))
+    if len(runs) < FEW_RUNS + 1 or not 0 < count < len(runs):
+        return set()
+    return set(sorted(runs, key=lambda r: hashlib.sha256(r.encode()).digest())[:count])
+
+
+def _reward(found: Fit) -> RewardWeights:
+    pairs = zip(found.names, found.weights, strict=True)
+    return RewardWeights(**{name: float(f"{weight:.{DIGITS}g}") for name, weight in pairs})
+
+
+_FIT_COLUMNS = ("model", "log_likelihood", *[f"off_{h:g}s" for h in HORIZONS], "windows")
+_PREDICTION_COLUMNS = ("example", "run", "model", "horizon", "off")
+
+
+def _fit_table(told: Mapping[str, float], predictions: pd.DataFrame) -> pd.DataFrame:
+    """One row per model: median log-likelihood per second, mean displacements (m)."""
+    off = predictions.pivot_table(index="model", columns="horizon", values="off", aggfunc="mean")
+    windows = predictions.groupby("model")["example"].nunique()
+    rows = []
+    for model in dict.fromkeys([*told, *off.index]):
+        row: dict[str, object] = {"model": model, "log_likelihood": told.get(model, np.nan)}
+        for horizon in HORIZONS:
+            known = model in off.index and horizon in off.columns
+            row[f"off_{horizon:g}s"] = off.loc[model, horizon] if known else np.nan
+        rows.append({**row, "windows": int(windows.get(model, 0))})
+    return pd.DataFrame(rows, columns=_FIT_COLUMNS).astype({"model": "string"})
+
+
+def _weight_table(
+    found: Fit, defaults: FloatArray, interval: tuple[FloatArray, FloatArray] | None
+) -> pd.DataFrame:
+    nothing = np.full(len(found.names), np.nan)
+    low, high = interval or (nothing, nothing)
+    known = [name not in found.kept_default for name in found.names]
+    return pd.DataFrame(
+        {
+            "term": found.names,
+            "default": defaults,
+            "learned": found.weights,
+            "low": np.where(known, low, np.nan),
+            "high": np.where(known, high, np.nan),
+            "error": found.error,
+            "identified": known,
+            "kept_default": [found.kept_default.get(name, "") for name in found.names],
+            "share": found.share,
+        }
+    ).astype({"term": "string", "kept_default": "string"})
+
+
+def _segment_table(segments: Segments, found: Fit) -> pd.DataFrame:
+    usable = segments.dropped == ""
+    each, misfit = (np.full(len(segments), np.nan) for _ in range(2))
+    kept = np.zeros(len(segments), dtype=bool)
+    each[usable], misfit[usable], kept[usable] = found.each, found.misfit, found.kept
+    reason = np.where(usable & ~kept, "trimmed", segments.dropped)
+    return pd.DataFrame(
+        {
+            "run": segments.run,
+            "vehicle": segments.vehicle,
+            "time": segments.time,
+            "log_likelihood": each,
+            "misfit": misfit,
+            "kept": kept,
+            "reason": reason,
+        }
+    ).astype(dict.fromkeys(("run", "vehicle", "reason"), "string"))
+
+
+def _warnings(
+    rows: pd.DataFrame, found: Fit, table: pd.DataFrame, runs: int, options: Options
+) -> tuple[str, ...]:
+    said = []
+    usable, n = rows["misfit"].notna(), len(rows)
+    if usable.sum() < FEW_SEGMENTS or runs < FEW_RUNS:
+        said.append(
+            f"{usable.sum()} segments from {runs} runs are few: give {FEW_SEGMENTS} or more from "
+            f"{FEW_RUNS} or more"
+        )
+    dropped = rows.loc[~usable, "reason"].value_counts()
+    if dropped.sum() > MUCH_DROPPED * n:
+        why = ", ".join(f"{reason}: {count}" for reason, count in dropped.items())
+        said.append(f"{dropped.sum()} of {n} segments are no optimum of this problem ({why})")
+    middle = float(np.median(found.misfit))
+    if not options.exact and not LEAST_MISFIT < middle < MOST_MISFIT:
+        said.append(
+            f"the median misfit is {middle:.2g}, not about 1: the reward does not describe this "
+            "driving"
+        )
+    if len(table):
+        by_model = table.set_index("model")
+        told = by_model["log_likelihood"]
+        if told[LEARNED] < told[DEFAULT]:
+            said.append("held-out driving is less likely than with the default weights")
+        last = next((c for c in _FIT_COLUMNS[-2:1:-1] if by_model[c].notna().all(axis=None)), "")
+        walked = [c for c in _FIT_COLUMNS[2:-1] if by_model[c].notna().sum() > 1]
+        del last
+        if (
+            walked
+            and by_model.loc[LEARNED, walked[-1]] > by_model.loc["constant velocity", walked[-1]]
+        ):
+            said.append(
+                f"after {walked[-1].removeprefix('off_')} constant velocity predicts held-out "
+                "driving better"
+            )
+    for name, why in found.kept_default.items():
+        if name not in options.fixed:
+            said.append(f"{name} keeps its default: {why}")
+    return tuple(said)
+
+
+def _counted(segments: Segments) -> dict[str, int]:
+    reasons = pd.Series(segments.dropped[segments.dropped != ""], dtype=object).value_counts()
+    return {str(reason): int(count) for reason, count in reasons.items()}
+
+
+def _digest(segments: Segments) -> str:
+    """Digest of the driving: where it began, what was around it, and what was chosen."""
+    found = hashlib.sha256()
+    for part in (segments.start, segments.stages, segments.controls):
+        found.update(np.ascontiguousarray(part).tobytes())
+    return found.hexdigest()[:32]
