@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import casadi as ca
@@ -26,6 +28,7 @@ from sumo_cohesion.planning.stage import UNLIMITED, StageParameters, make_stage
 from sumo_cohesion.road import RoadAhead
 from sumo_cohesion.state import Control, RoadState
 from tests.conftest import ROOT
+from tests.waiting import is_running, wait_for
 
 SETTINGS = PlannerSettings()
 OPTIONAL = ("curvature_change", "acceleration_change", "net_acceleration")
@@ -519,6 +522,64 @@ def test_without_a_working_compiler_it_plans_all_the_same(
     assert how.startswith("not compiled: ")
     assert said in how
     assert len(rest.splitlines()) == 20
+
+
+BLOCKED_COMPILER = """#!/bin/sh
+sleep 1000000 &
+echo $! > "$0.new"
+mv "$0.new" "$0.child"
+wait
+"""
+"""Compiles with a program of its own, for ever."""
+
+
+@pytest.fixture
+def blocked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """Make that the C compiler; the file in which the number of its child will be."""
+    compiler = tmp_path / "cc"
+    compiler.write_text(BLOCKED_COMPILER)
+    compiler.chmod(0o755)
+    for name, value in (("CC", compiler), ("XDG_CACHE_HOME", tmp_path)):
+        monkeypatch.setenv(name, str(value))
+    monkeypatch.delenv(compilation.SWITCH, raising=False)
+    child = tmp_path / "cc.child"
+    yield child
+    if child.exists() and is_running(int(child.read_text())):
+        os.kill(int(child.read_text()), signal.SIGKILL)
+
+
+def a_function() -> ca.Function:
+    x = ca.SX.sym("x")
+    return ca.Function("twice", [x], [2.0 * x])
+
+
+@pytest.mark.slow
+def test_a_compiler_that_is_given_up_ends_with_all_that_it_started(
+    blocked: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    patience = 0.1
+    while not blocked.exists():  # it has been given up before it had a child
+        patience *= 2.0
+        monkeypatch.setattr(compilation, "_PATIENCE", patience)
+        functions, how = compilation.compiled([a_function()])
+        compiler = blocked.with_suffix("")
+        assert how == f"not compiled: {compiler} was given up after {patience:g} s"
+        assert float(functions[0](3.0)) == 6.0
+    wait_for(lambda: not is_running(int(blocked.read_text())), what="the end of its child")
+
+
+@pytest.mark.slow
+def test_a_compiler_that_is_interrupted_ends_with_all_that_it_started(
+    blocked: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(*_: object, **__: object) -> None:
+        wait_for(blocked.exists, what="its child")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(subprocess.Popen, "communicate", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        compilation.compiled([a_function()])
+    wait_for(lambda: not is_running(int(blocked.read_text())), what="the end of its child")
 
 
 @pytest.mark.slow
