@@ -44,8 +44,9 @@ def reward_landscape(
     relative = reward.in_frames(symbols[0], symbols[1], cars)
     inputs = reward.StageInputs(lane, width, symbols[2], symbols[3], 0.0, *relative, cars[5, :].T)
     state = (symbols[0], symbols[1], 0.0, 0.0)
-    at = reward.Point(state, (0.0, 0.0), inputs, observation.ego_size[1])
-    terms = reward.terms(at)
+    stays = (0.0, 0.0)
+    at = reward.Point(state, stays, stays, inputs, observation.ego_size[1], settings.friction)
+    terms = reward.terms(at, PLACES)
     weighted = [getattr(settings.reward, name) * terms[name] for name in PLACES]
     function = ca.Function("landscape", [*symbols, lane, width], weighted)
     # CasADi takes one column per place; s runs fastest.

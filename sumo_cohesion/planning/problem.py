@@ -28,7 +28,7 @@ class Problem(NamedTuple):
     transitions : on how many of the stages, from the first, cohesion acts.
     place_weight, place_target : (T,) per m², beta included, and m: where across the road.
     constraint_weight : per m beyond a constraint.
-    theta : weights of the ego's own reward terms, in the order of RewardWeights.
+    theta : weights of the ego's own reward terms, in the order of RewardWeights.in_use.
     driven : the control of the step before, from which this one's may differ by so much; None if
         there is none to differ from.
     """

@@ -5,12 +5,14 @@ Each is a function of CasADi symbols, declared with its weight theta in RewardWe
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, NamedTuple
 
 import casadi as ca
 from pydantic import BaseModel, ConfigDict, Field
+
+from sumo_cohesion.state import STEP
 
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
@@ -62,14 +64,17 @@ class Point(NamedTuple):
     Attributes
     ----------
     state : s, d (m), heading (rad), speed (m/s) in the road's frame.
-    control : curvature (1/m), acceleration (m/s²).
+    control, before : curvature (1/m), acceleration (m/s²); and those of the stage before.
     inputs, ego_width : see StageInputs; m.
+    friction : linear friction (1/s), a number below 1 / STEP.
     """
 
     state: Any
     control: Any
+    before: Any
     inputs: StageInputs
     ego_width: Any
+    friction: float
 
 
 @dataclass(frozen=True)
@@ -82,10 +87,12 @@ class Term:
     squares : the same as pairs of residual r and weight w >= 0, both columns. The gradient of the
         term's cost is J'(w r), J the residuals' Jacobian; J'diag(w)J stands for its Hessian and is
         never negative, as the Hessian of a Gaussian is far from its centre.
+    of_change : it is about the control before: where there is none it has no weight.
     """
 
     value: Callable[[Point], Any]
     squares: Callable[[Point], list[tuple[Any, Any]]]
+    of_change: bool = False
 
 
 def _lane(at: Point) -> Any:
@@ -136,10 +143,28 @@ def _square_of(i: int) -> Term:
     return Term(lambda at: -(at.control[i] ** 2), lambda at: [(at.control[i], 2.0)])
 
 
+def _square_of_change(i: int) -> Term:
+    """Cost of how fast a control changes: the square of its change per second."""
+
+    def rate(at: Point) -> Any:
+        return (at.control[i] - at.before[i]) / STEP
+
+    return Term(lambda at: -(rate(at) ** 2), lambda at: [(rate(at), 2.0)], of_change=True)
+
+
+def _net_acceleration(at: Point) -> Any:
+    return -(_net(at) ** 2)
+
+
+def _net_acceleration_squares(at: Point) -> list[tuple[Any, Any]]:
+    return [(_net(at), 2.0)]
+
+
 class RewardWeights(BaseModel):
     """Weights theta of the reward terms phi (paper, eq. 1); each term says its own unit.
 
-    A term is one field: its name, how it is worked out, and its weight.
+    A term is one field: its name, how it is worked out, and its weight. One whose default is 0 is
+    optional: unless it is given a weight it is no part of the problem.
 
     Attributes
     ----------
@@ -148,6 +173,10 @@ class RewardWeights(BaseModel):
     speed : per (m/s)², cost of missing the speed limit.
     car : cost at the centre of another car.
     curvature, acceleration : per (1/m)² and (m/s²)², cost of control.
+    curvature_change, acceleration_change : per (1/m/s)² and (m/s³)², cost of changing it; optional.
+    net_acceleration : per (m/s²)², cost of the acceleration that friction leaves; optional. In the
+        place of ``acceleration``, which charges what holding a speed against friction takes:
+        whoever sets one sets the other to 0.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -158,29 +187,53 @@ class RewardWeights(BaseModel):
     car: Annotated[NonNegative, Term(_car, _car_squares)] = 100.0
     curvature: Annotated[NonNegative, _square_of(0)] = 80.0
     acceleration: Annotated[NonNegative, _square_of(1)] = 1.2e-4
+    curvature_change: Annotated[NonNegative, _square_of_change(0)] = 0.0
+    acceleration_change: Annotated[NonNegative, _square_of_change(1)] = 0.0
+    net_acceleration: Annotated[NonNegative, Term(_net_acceleration, _net_acceleration_squares)] = (
+        0.0
+    )
+
+    @property
+    def in_use(self) -> tuple[str, ...]:
+        """Names of the terms that are part of the problem, in the order of the fields."""
+        fields = type(self).model_fields.items()
+        return tuple([n for n, field in fields if field.default > 0.0 or getattr(self, n) > 0.0])
 
     @property
     def theta(self) -> tuple[float, ...]:
-        """The weights as a vector, in the order of the fields."""
-        return tuple([getattr(self, name) for name in type(self).model_fields])
+        """The weights of the terms in use, as a vector."""
+        return tuple([getattr(self, name) for name in self.in_use])
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """Names of the parts of a stage's reward: the terms in use, and what is no term of it."""
+        return (*self.in_use, "cohesion", "constraints")
+
+    @property
+    def shape(self) -> RewardWeights:
+        """The same for all weights of the same terms."""
+        return RewardWeights(**dict.fromkeys(self.in_use, 1.0))
 
 
 _TERMS = {
     name: next(part for part in field.metadata if isinstance(part, Term))
     for name, field in RewardWeights.model_fields.items()
 }
-TERMS = (*_TERMS, "cohesion", "constraints")
-"""Names of the parts of a stage's reward."""
 
 
-def terms(at: Point) -> dict[str, Any]:
+def terms(at: Point, names: Sequence[str]) -> dict[str, Any]:
     """Reward terms by name, unweighted; costs are negative."""
-    return {name: term.value(at) for name, term in _TERMS.items()}
+    return {name: _TERMS[name].value(at) for name in names}
 
 
-def squares(at: Point) -> dict[str, list[tuple[Any, Any]]]:
+def squares(at: Point, names: Sequence[str]) -> dict[str, list[tuple[Any, Any]]]:
     """Return the same terms as weighted squares, see Term."""
-    return {name: term.squares(at) for name, term in _TERMS.items()}
+    return {name: _TERMS[name].squares(at) for name in names}
+
+
+def of_change(names: Sequence[str]) -> list[bool]:
+    """Tell of each term whether it is about the control before, see Term."""
+    return [_TERMS[name].of_change for name in names]
 
 
 def _lanes(at: Point) -> Any:
@@ -197,3 +250,9 @@ def _beyond_edges(at: Point) -> tuple[Any, Any]:
 def _cars(at: Point) -> Any:
     """Squared distance to every car, in its half length along and CAR_SIGMA_LATERAL across."""
     return at.inputs.along**2 + (at.inputs.across / CAR_SIGMA_LATERAL) ** 2
+
+
+def _net(at: Point) -> Any:
+    """Acceleration that friction leaves, (v' - v) / STEP, of the speed v' where the stage leads."""
+    drag = at.friction * at.state[3]
+    return (at.control[1] - drag) / (1.0 - at.friction * STEP)

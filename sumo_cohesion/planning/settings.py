@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
 from sumo_cohesion.planning.reward import RewardWeights
 from sumo_cohesion.planning.solvers import SOLVERS
+from sumo_cohesion.state import STEP
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
@@ -39,6 +40,7 @@ class PlannerSettings(BaseModel):
     last_resort : check every plan before it is driven (planning.safety).
     max_iterations : after which a solve has failed. Not a time limit, which would make two
         runs of the same seed differ.
+    reward : weights of the ego's own reward (planning.reward).
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -57,6 +59,15 @@ class PlannerSettings(BaseModel):
     max_iterations: Annotated[int, Field(ge=1)] = 100
     last_resort: bool = True
     reward: RewardWeights = RewardWeights()
+
+    @model_validator(mode="after")
+    def _speed_says_acceleration(self) -> PlannerSettings:
+        if self.reward.net_acceleration > 0.0 and self.friction * STEP >= 1.0:
+            raise ValueError(
+                f"reward.net_acceleration needs a friction below {1.0 / STEP:g} 1/s, "
+                f"not {self.friction:g}"
+            )
+        return self
 
     def sharpest(self, speed: float) -> float:
         """Largest curvature (1/m) at a speed (m/s): the car's, or its tyres'."""

@@ -12,7 +12,7 @@ import casadi as ca
 import numpy as np
 
 from sumo_cohesion.planning import constraints, dynamics, reward
-from sumo_cohesion.planning.reward import Point, RewardWeights
+from sumo_cohesion.planning.reward import Point
 from sumo_cohesion.planning.settings import PlannerSettings
 from sumo_cohesion.social.features import FEATURES, social_features
 from sumo_cohesion.state import STEP
@@ -71,7 +71,7 @@ class StageParameters:
         k, self.n_cars, self.n_lanes = len(FEATURES), settings.cars, n_lanes
         self.sizes = {
             "ego_width": 1,
-            "theta": len(RewardWeights.model_fields),
+            "theta": len(settings.reward.in_use),
             "road_curvature": 1,
             "lanes": n_lanes,
             "lane_widths": n_lanes,
@@ -121,17 +121,18 @@ def make_stage(settings: PlannerSettings, parameters: StageParameters) -> Stage:
         half_widths=cars[5, :].T,
     )
     # Original reward, eq. 1.
-    at = Point(after, physical, inputs, p["ego_width"])
-    own = reward.terms(at)
-    theta = dict(zip(RewardWeights.model_fields, ca.vertsplit(p["theta"]), strict=True))
-    terms = {name: theta[name] * own[name] for name in RewardWeights.model_fields}
+    last = [state[4 + i] * SCALES[i] for i in range(2)]
+    at = Point(after, physical, last, inputs, p["ego_width"], settings.friction)
+    names = settings.reward.in_use
+    theta = dict(zip(names, ca.vertsplit(p["theta"]), strict=True))
+    terms = {name: theta[name] * value for name, value in reward.terms(at, names).items()}
     # Cohesion, eq. 2: distance of the ego's social features from the groups' means.
     psi = ca.vertcat(*social_features(before, after, STEP, p["road_curvature"]))
     missed, aside = psi - p["cohesion_target"], after[1] - p["place_target"]
     terms["cohesion"] = -ca.dot(p["cohesion_weight"], missed**2) - p["place_weight"] * aside**2
     violation = constraints.violations(after, inputs, p["ego_width"])
     terms["constraints"] = -p["constraint_weight"] * ca.sum1(constraints.penalties(violation))
-    rows = reward.squares(at)
+    rows = reward.squares(at, names)
     pairs = [(r, theta[name] * w) for name in rows for r, w in rows[name]]
     pairs.append((violation, p["constraint_weight"] * constraints.penalty_weights(violation)))
     pairs += [(missed, 2.0 * p["cohesion_weight"]), (aside, 2.0 * p["place_weight"])]
@@ -191,7 +192,7 @@ def limited_stage(stage: Stage, settings: PlannerSettings) -> Any:
     low, high, change = ca.SX.sym("low", 2), ca.SX.sym("high", 2), ca.SX.sym("change", 2)
     lowest, highest = control_limits(stage.state, low, high, change, settings)
     control = ca.fmin(ca.fmax(stage.control, lowest), highest)
-    (terms,) = stage.landed(ca.vertcat(*[stage.terms[name] for name in reward.TERMS]))
+    (terms,) = stage.landed(ca.vertcat(*[stage.terms[name] for name in settings.reward.parts]))
     after = ca.substitute([stage.next_state, terms], [stage.control], [control])
     return ca.Function(
         "stage",

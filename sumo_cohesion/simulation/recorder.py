@@ -12,7 +12,6 @@ import pandas as pd
 from sumo_cohesion.errors import SimulationError
 from sumo_cohesion.planning.explanation import Explanation
 from sumo_cohesion.planning.planners import planned_states
-from sumo_cohesion.planning.reward import TERMS
 from sumo_cohesion.simulation.episode import Ending, Moment, Seconds
 from sumo_cohesion.social.features import FEATURES, LATERAL
 from sumo_cohesion.state import (
@@ -168,7 +167,8 @@ class Recorder:
         right, left = self._road.drivable_at(ego[:, 0], ego[:, 1])
         limit = self._road.speed_limit_at(ego[:, 0])
         on_exit = self._on_exit(ego)
-        rows, no_reward = [], {f"reward_{name}": float("nan") for name in TERMS}
+        parts = self._setup.settings.reward.parts
+        rows, no_reward = [], {f"reward_{name}": float("nan") for name in parts}
         for i, (time, _, plan) in enumerate(self._plans):
             control = plan.controls[0] if plan.controls else _NO_CONTROL
             row: dict[str, object] = {

@@ -50,7 +50,8 @@ PLAN = (
         "float64",
         "",
         "reward term over the horizon, weighted: lane, edge, speed, car, curvature, acceleration, "
-        "cohesion (beta included), constraints (penalties), and what a planner of one's own names",
+        "those that are off unless they are given a weight, cohesion (beta included), constraints "
+        "(penalties), and what a planner of one's own names",
     ),
 )
 

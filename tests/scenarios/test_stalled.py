@@ -13,7 +13,7 @@ import pytest
 
 import sumo_cohesion
 from sumo_cohesion import Rollout, compare, load_metrics, run
-from sumo_cohesion.planning.reward import TERMS
+from sumo_cohesion.planning.reward import RewardWeights
 from sumo_cohesion.tables.columns import TABLES
 from tests.conftest import ROOT
 from tests.waiting import Gate, is_running, started, wait_for
@@ -64,7 +64,7 @@ def test_tables_have_the_documented_columns_and_no_surprises(pair: Path) -> None
     for name, columns in TABLES.items():
         documented = [c.name for c in columns if not c.name.endswith("*")]
         if name == "plan":
-            documented += [f"reward_{term}" for term in TERMS]
+            documented += [f"reward_{part}" for part in RewardWeights().parts]
         assert list(getattr(rollout, name).columns) == documented
     assert np.isfinite(rollout.trajectory.select_dtypes("number")).all().all()
     assert rollout.info["versions"]["libsumo"]
@@ -73,6 +73,21 @@ def test_tables_have_the_documented_columns_and_no_surprises(pair: Path) -> None
     assert not hidden["visible"].any()
     steps = rollout.plan["time"].diff().dropna()
     assert steps.to_numpy() == pytest.approx(0.1)
+
+
+@pytest.mark.slow
+def test_steering_is_smooth_if_its_change_costs() -> None:
+    changes, shift = [], []
+    for weight in (0.0, 20000.0):
+        overrides = {"duration": 25.0, "planner.reward.curvature_change": weight}
+        rollout = run("stalled_swerve", "cohesive", 1000, overrides=overrides)
+        plan = rollout.plan
+        assert ("reward_curvature_change" in plan.columns) == (weight > 0.0)
+        assert (plan["status"] == "solved").all()
+        changes.append(float((plan["curvature"].diff() ** 2).sum()))
+        shift.append(rollout.trajectory.query("vehicle == 'ego'")["d"].max())
+    assert changes[1] < 0.9 * changes[0]
+    assert min(shift) > 0.5  # both swerve
 
 
 @pytest.mark.slow

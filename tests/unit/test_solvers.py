@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import casadi as ca
@@ -15,18 +17,27 @@ from hypothesis import strategies as st
 
 from sumo_cohesion.planning.dynamics import step
 from sumo_cohesion.planning.problem import FAR_AWAY, Problem, Solution
+from sumo_cohesion.planning.reward import RewardWeights
 from sumo_cohesion.planning.settings import PlannerSettings
 from sumo_cohesion.planning.solvers import SOLVERS
 from sumo_cohesion.planning.solvers import compiled as compilation
-from sumo_cohesion.planning.solvers.ilqr import _box_step
+from sumo_cohesion.planning.solvers.ilqr import _box_step, _quadratic
 from sumo_cohesion.planning.solvers.mpc import Mpc
 from sumo_cohesion.planning.solvers.transcription import Transcription
 from sumo_cohesion.planning.stage import UNLIMITED, StageParameters, make_stage
 from sumo_cohesion.road import RoadAhead
 from sumo_cohesion.state import Control, RoadState
 from tests.conftest import ROOT
+from tests.waiting import is_running, wait_for
 
 SETTINGS = PlannerSettings()
+OPTIONAL = ("curvature_change", "acceleration_change", "net_acceleration")
+SMOOTH = PlannerSettings(
+    reward=RewardWeights(
+        acceleration=0.0, curvature_change=2000.0, acceleration_change=1e-3, net_acceleration=0.01
+    )
+)
+"""With all optional terms."""
 LANES = np.array([-3.5, 0.0, 3.5])
 
 
@@ -64,9 +75,18 @@ def problem(seed: int, horizon: int = 10, cohesion: float = 1.0) -> Problem:
     )
 
 
+def controllers(planner: PlannerSettings) -> dict[str, Mpc]:
+    return {name: Mpc(planner.model_copy(update={"solver": name}), 3) for name in SOLVERS}
+
+
 @pytest.fixture(scope="module")
 def solvers() -> dict[str, Mpc]:
-    return {name: Mpc(SETTINGS.model_copy(update={"solver": name}), 3) for name in SOLVERS}
+    return controllers(SETTINGS)
+
+
+@pytest.fixture(scope="module")
+def smooth_solvers() -> dict[str, Mpc]:
+    return controllers(SMOOTH)
 
 
 @pytest.mark.parametrize("seed", range(25))
@@ -87,9 +107,113 @@ def test_all_solvers_agree_and_keep_their_promises(solvers: dict[str, Mpc], seed
     assert value["ilqr"] >= others[1] - scale  # no worse than the middle one of the others
 
 
-def test_squares_have_the_gradient_of_the_cost_and_are_never_negative() -> None:
-    parameters = StageParameters(SETTINGS, 3)
-    stage = make_stage(SETTINGS, parameters)
+@pytest.mark.parametrize("seed", range(25))
+def test_all_solvers_agree_on_the_optional_terms(smooth_solvers: dict[str, Mpc], seed: int) -> None:
+    asked = problem(seed)._replace(theta=SMOOTH.reward.theta)
+    found, value = {}, {}
+    for name, mpc in smooth_solvers.items():
+        mpc.reset()
+        found[name] = mpc.solve(asked)
+        assert found[name].status == "solved", name
+        value[name] = sum(found[name].reward.values())
+    scale = 1e-4 * (1.0 + abs(value["ipopt"]))
+    for name in ("ilqr", "fatrop"):
+        assert value[name] == pytest.approx(value["ipopt"], abs=scale)
+        assert found[name].states == pytest.approx(found["ipopt"].states, abs=0.01)
+    assert value["lbfgs"] >= value["ipopt"] - scale  # it keeps the first control's rates only
+    for solution in found.values():
+        expected = optional_terms(asked, solution)
+        assert [solution.reward[name] for name in OPTIONAL] == pytest.approx(expected, rel=1e-4)
+
+
+def optional_terms(asked: Problem, solution: Solution) -> list[float]:
+    """Work out what the optional terms are worth, from what is driven; SI units."""
+    rates = np.diff(solution.controls, axis=0) / 0.1
+    if asked.driven is not None:
+        bounded = Transcription(SMOOTH, 3).write(asked)
+        assert bounded is not None
+        before = bounded.start[4:] * (0.01, 5.0)
+        rates = np.vstack(((solution.controls[0] - before) / 0.1, rates))
+    gained = np.diff(solution.states[:, 3]) / 0.1
+    squares = np.array((*np.sum(rates**2, axis=0), np.sum(gained**2)))
+    return [-w * s for w, s in zip(SMOOTH.reward.theta[-3:], squares, strict=True)]
+
+
+def test_what_has_no_weight_is_no_part_of_the_problem() -> None:
+    plain, smooth = (StageParameters(one, 3).sizes for one in (SETTINGS, SMOOTH))
+    assert plain["theta"] == 6
+    assert smooth == {**plain, "theta": 9}
+    for name in OPTIONAL:
+        weights = RewardWeights(**{name: 1.0})
+        assert weights.in_use == (*SETTINGS.reward.in_use, name)
+        assert weights.parts == (*weights.in_use, "cohesion", "constraints")
+        assert weights.theta == (*SETTINGS.reward.theta, 1.0)
+    # One that is not optional may have none, and stays.
+    assert RewardWeights(acceleration=0.0).in_use == SETTINGS.reward.in_use
+    for one in (SETTINGS, SMOOTH):
+        assert tuple(make_stage(one, StageParameters(one, 3)).terms) == one.reward.parts
+
+
+def test_where_nothing_was_driven_before_no_change_costs() -> None:
+    transcription, asked = Transcription(SMOOTH, 3), problem(7)
+    theta = SMOOTH.reward.theta
+    asked = asked._replace(theta=theta)
+    columns = StageParameters(SMOOTH, 3).columns("theta")
+    for driven, first in (
+        (None, (*theta[:6], 0.0, 0.0, theta[8])),
+        (Control(0.0, 0.0), theta),
+    ):
+        instance = transcription.write(asked._replace(driven=driven))
+        assert instance is not None
+        rows = instance.stages[:, columns]
+        assert rows[0].tolist() == list(first)
+        assert (rows[1:] == theta).all()
+
+
+def test_acceleration_net_of_friction_needs_a_friction_that_leaves_some() -> None:
+    weights = RewardWeights(net_acceleration=1.0)
+    assert PlannerSettings(friction=9.9, reward=weights).friction == 9.9
+    assert PlannerSettings(friction=10.0).friction == 10.0
+    with pytest.raises(ValueError, match="net_acceleration needs a friction below 10 1/s, not 10"):
+        PlannerSettings(friction=10.0, reward=weights)
+
+
+@pytest.mark.parametrize("planner", [SETTINGS, SMOOTH], ids=["plain", "smooth"])
+def test_the_quadratic_model_is_that_of_the_cost(planner: PlannerSettings) -> None:
+    """Put together by the chain rule, it is what derivatives of the whole expression are."""
+    stage = make_stage(planner, StageParameters(planner, 3))
+    z = ca.vertcat(stage.state, stage.control)
+    price, curved = ca.SX.sym("price", 6), ca.SX.sym("curved", 6, 6)
+    exact = _quadratic(stage, price, curved, exact=True)
+    squares = _quadratic(stage, price, curved, exact=False)
+    cost, residuals, weights = stage.landed(stage.cost, stage.residuals, stage.residual_weights)
+    move, rows = ca.jacobian(stage.next_state, z), ca.jacobian(residuals, z)
+    beyond = move.T @ curved @ move
+    hessian, gradient = ca.hessian(cost + ca.dot(price, stage.next_state), z)
+    semidefinite = rows.T @ (ca.repmat(weights, 1, 8) * rows)
+    expected = [gradient, hessian + beyond, gradient, semidefinite + beyond]
+    inputs = [z, stage.parameters, price, curved]
+    found, expected = (ca.Function("f", inputs, each) for each in ([*exact, *squares], expected))
+    transcription = Transcription(planner, 3)
+    for seed in range(30):
+        asked = problem(seed)._replace(theta=planner.reward.theta)
+        instance = transcription.write(asked)
+        assert instance is not None
+        rng = np.random.default_rng(seed)
+        root = rng.normal(size=(6, 6))
+        where = np.concatenate((asked.ego, rng.normal(size=4)))
+        numbers = where, instance.stages[1], rng.normal(size=6), root @ root.T
+        both = [[np.asarray(value) for value in f(*numbers)] for f in (found, expected)]
+        for ours, whole in zip(*both, strict=True):
+            assert ours == pytest.approx(whole, abs=1e-9 * (1.0 + np.abs(whole).max()))
+
+
+@pytest.mark.parametrize("planner", [SETTINGS, SMOOTH], ids=["plain", "smooth"])
+def test_squares_have_the_gradient_of_the_cost_and_are_never_negative(
+    planner: PlannerSettings,
+) -> None:
+    parameters = StageParameters(planner, 3)
+    stage = make_stage(planner, parameters)
     z = ca.vertcat(stage.state, stage.control)
     cost, residuals = stage.landed(stage.cost, stage.residuals)
     (weights,) = stage.landed(stage.residual_weights)
@@ -99,9 +223,9 @@ def test_squares_have_the_gradient_of_the_cost_and_are_never_negative() -> None:
         [z, stage.parameters],
         [ca.gradient(cost, z), jacobian.T @ (weights * residuals), weights],
     )
-    transcription = Transcription(SETTINGS, 3)
+    transcription = Transcription(planner, 3)
     for seed in range(50):
-        asked = problem(seed)
+        asked = problem(seed)._replace(theta=planner.reward.theta)
         instance = transcription.write(asked)
         assert instance is not None
         control = np.random.default_rng(seed).normal(size=4)
@@ -398,6 +522,64 @@ def test_without_a_working_compiler_it_plans_all_the_same(
     assert how.startswith("not compiled: ")
     assert said in how
     assert len(rest.splitlines()) == 20
+
+
+BLOCKED_COMPILER = """#!/bin/sh
+sleep 1000000 &
+echo $! > "$0.new"
+mv "$0.new" "$0.child"
+wait
+"""
+"""Compiles with a program of its own, for ever."""
+
+
+@pytest.fixture
+def blocked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """Make that the C compiler; the file in which the number of its child will be."""
+    compiler = tmp_path / "cc"
+    compiler.write_text(BLOCKED_COMPILER)
+    compiler.chmod(0o755)
+    for name, value in (("CC", compiler), ("XDG_CACHE_HOME", tmp_path)):
+        monkeypatch.setenv(name, str(value))
+    monkeypatch.delenv(compilation.SWITCH, raising=False)
+    child = tmp_path / "cc.child"
+    yield child
+    if child.exists() and is_running(int(child.read_text())):
+        os.kill(int(child.read_text()), signal.SIGKILL)
+
+
+def a_function() -> ca.Function:
+    x = ca.SX.sym("x")
+    return ca.Function("twice", [x], [2.0 * x])
+
+
+@pytest.mark.slow
+def test_a_compiler_that_is_given_up_ends_with_all_that_it_started(
+    blocked: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    patience = 0.1
+    while not blocked.exists():  # it has been given up before it had a child
+        patience *= 2.0
+        monkeypatch.setattr(compilation, "_PATIENCE", patience)
+        functions, how = compilation.compiled([a_function()])
+        compiler = blocked.with_suffix("")
+        assert how == f"not compiled: {compiler} was given up after {patience:g} s"
+        assert float(functions[0](3.0)) == 6.0
+    wait_for(lambda: not is_running(int(blocked.read_text())), what="the end of its child")
+
+
+@pytest.mark.slow
+def test_a_compiler_that_is_interrupted_ends_with_all_that_it_started(
+    blocked: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(*_: object, **__: object) -> None:
+        wait_for(blocked.exists, what="its child")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(subprocess.Popen, "communicate", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        compilation.compiled([a_function()])
+    wait_for(lambda: not is_running(int(blocked.read_text())), what="the end of its child")
 
 
 @pytest.mark.slow

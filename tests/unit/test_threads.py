@@ -63,11 +63,15 @@ def test_two_planners_in_two_threads_plan_as_each_would_alone(how: str) -> None:
 
 
 def test_other_reward_weights_need_no_other_solver() -> None:
-    """Theta is part of the problem: what is built serves all weights."""
+    """Theta is part of the problem: what is built serves all weights of the same terms."""
     other = SETTINGS.model_copy(update={"reward": RewardWeights(curvature=8000.0)})
     assert shared_solver("ilqr", other, 3) is shared_solver("ilqr", SETTINGS, 3)
     longer = PlannerSettings(horizon=12)
     assert shared_solver("ilqr", longer, 3) is not shared_solver("ilqr", SETTINGS, 3)
+    changes = SETTINGS.model_copy(update={"reward": RewardWeights(curvature_change=1.0)})
+    stiffer = SETTINGS.model_copy(update={"reward": RewardWeights(curvature_change=9.0)})
+    assert shared_solver("fatrop", changes, 3) is shared_solver("fatrop", stiffer, 3)
+    assert shared_solver("fatrop", changes, 3) is not shared_solver("fatrop", SETTINGS, 3)
     mpc, asked = Mpc(SETTINGS, 3), problem(3, cohesion=0.0)
     usual = mpc.solve(asked)
     mpc.reset()

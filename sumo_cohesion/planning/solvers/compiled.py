@@ -12,6 +12,7 @@ import hashlib
 import os
 import platform
 import shutil
+import signal
 import subprocess
 import tempfile
 import threading
@@ -105,12 +106,39 @@ def _compile(code: str, compiler: str, library: Path) -> None:
         source, new = Path(folder) / "planner.c", Path(folder) / "planner.so"
         source.write_text(code)
         command = [compiler, *OPTIONS, str(source), "-o", str(new), "-lm"]
-        done = subprocess.run(
-            command, capture_output=True, text=True, timeout=_PATIENCE, check=False
-        )
-        if done.returncode:
-            raise RuntimeError(f"{compiler} failed: {done.stderr[-200:]}")
+        try:
+            failed, said = _call(command)
+        except subprocess.TimeoutExpired:
+            raise RuntimeError(f"{compiler} was given up after {_PATIENCE:g} s") from None
+        if failed:
+            raise RuntimeError(f"{compiler} failed: {said[-200:]}")
         new.replace(library)
+
+
+def _call(command: Sequence[str]) -> tuple[int, str]:
+    """Run a compiler: its exit status and what it said on standard error.
+
+    What it starts is in its group, and ends with it if it is given up or interrupted.
+    """
+    with subprocess.Popen(
+        command,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        errors="replace",
+        start_new_session=True,
+    ) as process:
+        try:
+            _, said = process.communicate(timeout=_PATIENCE)
+        except BaseException:
+            try:
+                os.killpg(process.pid, signal.SIGKILL)
+            except ProcessLookupError:  # all have ended
+                pass
+            except (AttributeError, PermissionError):  # Windows; macOS, if all are zombies
+                process.kill()
+            raise
+    return process.returncode, said
 
 
 Numbers: TypeAlias = "FloatArray | array[float]"

@@ -25,7 +25,6 @@ import casadi as ca
 import numpy as np
 
 from sumo_cohesion.planning.problem import Instance, Solution
-from sumo_cohesion.planning.reward import TERMS
 from sumo_cohesion.planning.settings import PlannerSettings
 from sumo_cohesion.planning.solvers.compiled import BoundCall, Numbers, compiled
 from sumo_cohesion.planning.stage import (
@@ -84,7 +83,8 @@ class Ilqr:
         """
         t, f = self._settings.horizon, np.zeros
         self._x, self._u = [f((t + 1, N_STATES)) for _ in range(2)], [f((t, 2)) for _ in range(2)]
-        self._terms = [f(len(TERMS)) for _ in range(2)]
+        self._parts = self._settings.reward.parts
+        self._terms = [f(len(self._parts)) for _ in range(2)]
         self._present = 0
         self._guess, self._step, self._gain = f((t, 2)), f((t, 2)), f((t, N_STATES, 2))
         # Python's arrays: their items are Python's numbers, which are faster than NumPy's.
@@ -192,7 +192,7 @@ class Ilqr:
             status=status,
             iterations=iterations,
             wall_time=time.perf_counter() - start,
-            reward=dict(zip(TERMS, self._terms[self._present].tolist(), strict=True)),
+            reward=dict(zip(self._parts, self._terms[self._present].tolist(), strict=True)),
         )
 
 
@@ -267,11 +267,13 @@ def _quadratic(stage: Stage, gradient: Any, hessian: Any, *, exact: bool) -> tup
     """Gradient and Hessian, in (state, control), of a stage's cost and the cost-to-go after it.
 
     The cost is a function of w = (landing, road state, control) and of the place relative to every
-    car, of few of which each part of it depends; the chain rule does the rest. Exact: the dynamics'
-    own curvature, weighted by all that depends on where they lead, belongs to it (DDP).
+    car, of few of which each part of it depends; the chain rule does the rest. The control before
+    is part of w if the cost depends on it. Exact: the dynamics' own curvature, weighted by all that
+    depends on where they lead, belongs to it (DDP).
     """
     z = ca.vertcat(stage.state, stage.control)
-    here = ca.vertcat(stage.state[:4], stage.control)
+    changes = ca.depends_on(stage.cost, stage.state[4:])
+    here = z if changes else ca.vertcat(stage.state[:4], stage.control)
     w = ca.vertcat(stage.landing, here)
     move, pick = ca.jacobian(stage.next_state, z), ca.jacobian(here, z)
     v = ca.vertcat(w, stage.relative)
@@ -388,7 +390,7 @@ def _driven(
     ``given`` are parameters and bounds, a column per stage.
     """
     one = limited_stage(stage, settings)
-    states, controls, total = [start], [], ca.MX.zeros(len(TERMS))
+    states, controls, total = [start], [], ca.MX.zeros(len(settings.reward.parts))
     for i in range(settings.horizon):
         wanted = policy(i, states[-1])
         state, control, terms = one(states[-1], wanted, *[column[:, i] for column in given])

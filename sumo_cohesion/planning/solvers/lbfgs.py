@@ -13,7 +13,6 @@ import numpy as np
 from scipy.optimize import minimize
 
 from sumo_cohesion.planning.problem import Instance, Solution
-from sumo_cohesion.planning.reward import TERMS
 from sumo_cohesion.planning.settings import PlannerSettings
 from sumo_cohesion.planning.solvers.compiled import BoundCall, compiled
 from sumo_cohesion.planning.stage import (
@@ -36,10 +35,10 @@ class Lbfgs:
         self._settings = settings
         parameters = StageParameters(settings, n_lanes)
         one = limited_stage(make_stage(settings, parameters), settings)
-        t = settings.horizon
+        t, self._parts = settings.horizon, settings.reward.parts
         start, u = ca.MX.sym("start", N_STATES), ca.MX.sym("u", 2, t)
         p = ca.MX.sym("p", parameters.size, t)
-        state, total, states, driven = start, ca.MX.zeros(len(TERMS)), [start], []
+        state, total, states, driven = start, ca.MX.zeros(len(self._parts)), [start], []
         for i in range(t):
             state, control, gained = one(state, u[:, i], p[:, i], -ca.inf, ca.inf, UNLIMITED)
             states.append(state)
@@ -56,7 +55,7 @@ class Lbfgs:
         self._u = np.zeros((t, 2))
         self._cost, self._gradient = np.zeros(1), np.zeros((t, 2))
         self._states, self._driven = np.zeros((t + 1, N_STATES)), np.zeros((t, 2))
-        self._terms = np.zeros(len(TERMS))
+        self._terms = np.zeros(len(self._parts))
         outputs = [self._cost, self._gradient, self._states, self._driven, self._terms]
         self._run = BoundCall(function, [self._start, self._u, self._p], outputs)
 
@@ -87,7 +86,7 @@ class Lbfgs:
             status="solved" if solved else f"{self.name} returned {result.message}",
             iterations=int(result.nit),
             wall_time=time.perf_counter() - start,
-            reward=dict(zip(TERMS, self._terms.tolist(), strict=True)),
+            reward=dict(zip(self._parts, self._terms.tolist(), strict=True)),
         )
 
     def _cost_and_gradient(self, u: FloatArray) -> tuple[float, FloatArray]:

@@ -13,7 +13,6 @@ from typing import Protocol
 import numpy as np
 
 from sumo_cohesion.planning.problem import Instance, Problem, Solution
-from sumo_cohesion.planning.reward import RewardWeights
 from sumo_cohesion.planning.settings import PlannerSettings
 from sumo_cohesion.planning.solvers import SOLVERS
 from sumo_cohesion.planning.solvers.compiled import BUILDING
@@ -58,13 +57,14 @@ _BUILT = _Built()
 def shared_solver(name: str, settings: PlannerSettings, n_lanes: int) -> Solver:
     """Return a solver, built once per thread: it remembers nothing between two solves.
 
-    The reward weights are part of the problem: they need no solver of their own.
+    The reward weights are part of the problem: they need no solver of their own, but which optional
+    terms there are does.
     """
     return _BUILT.solver(name, _shape(settings), n_lanes)
 
 
 def _shape(settings: PlannerSettings) -> PlannerSettings:
-    return settings.model_copy(update={"reward": RewardWeights()})
+    return settings.model_copy(update={"reward": settings.reward.shape})
 
 
 class _Tools(threading.local):

@@ -15,7 +15,6 @@ import numpy as np
 
 from sumo_cohesion.planning import dynamics
 from sumo_cohesion.planning.problem import Instance, Solution
-from sumo_cohesion.planning.reward import TERMS
 from sumo_cohesion.planning.settings import PlannerSettings
 from sumo_cohesion.planning.stage import (
     CONTROL_SCALE,
@@ -51,15 +50,15 @@ class InteriorPoint:
         self._settings = settings
         layout = StageParameters(settings, n_lanes)
         self._bends = layout.columns("road_curvature")
-        horizon = settings.horizon
+        horizon, self._parts = settings.horizon, settings.reward.parts
         stage = make_stage(settings, layout)
-        terms = stage.landed(ca.vertcat(*[stage.terms[term] for term in TERMS]))
+        terms = stage.landed(ca.vertcat(*[stage.terms[term] for term in self._parts]))
         one = ca.Function("stage", stage.inputs(), [stage.next_state, *terms])
         start, p = ca.SX.sym("start", N_STATES), ca.SX.sym("p", layout.size, horizon)
         change = ca.SX.sym("change", 2, horizon)
         states = [ca.SX.sym(f"x{t}", N_STATES) for t in range(horizon + 1)]
         controls = [ca.SX.sym(f"u{t}", 2) for t in range(horizon)]
-        unknowns, constraints, total = [], [], ca.SX.zeros(len(TERMS))
+        unknowns, constraints, total = [], [], ca.SX.zeros(len(self._parts))
         equality: list[bool] = []
         for t in range(horizon):
             stepped, gained = one(states[t], controls[t], p[:, t])
@@ -119,7 +118,7 @@ class InteriorPoint:
             status="solved" if solved else f"{self.name} returned {stats['return_status']}",
             iterations=int(stats["iter_count"]),
             wall_time=time.perf_counter() - start,
-            reward=dict(zip(TERMS, values, strict=True)) if solved else {},
+            reward=dict(zip(self._parts, values, strict=True)) if solved else {},
         )
 
     def _bounds(self, instance: Instance) -> tuple[FloatArray, FloatArray]:

@@ -13,7 +13,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from sumo_cohesion.planning import dynamics
+from sumo_cohesion.planning import dynamics, reward
 from sumo_cohesion.planning.problem import FAR_AWAY, Instance, Problem, Solution
 from sumo_cohesion.planning.settings import PlannerSettings
 from sumo_cohesion.planning.solvers.compiled import BoundCall, compiled
@@ -170,9 +170,15 @@ def _stage_numbers(settings: PlannerSettings, layout: StageParameters) -> Any:
     theta, limits = ca.SX.sym("theta", layout.sizes["theta"]), ca.SX.sym("limits", len(_LIMITS))
     i = ca.SX.sym("i")
     ahead = STEP * (i + 1)
+    free = ca.logic_and(i < 1, parts["is_driven"] < 1)
+    of_change = reward.of_change(settings.reward.in_use)
+    weights = [
+        ca.if_else(free, 0.0, weight) if changes else weight
+        for weight, changes in zip(ca.vertsplit(theta), of_change, strict=True)
+    ]
     numbers = {
         "ego_width": parts["ego_size"][1],
-        "theta": theta,
+        "theta": ca.vertcat(*weights),
         "road_curvature": before[-1],
         "lanes": ca.fmin(road[:n_lanes], FAR_AWAY),
         "lane_widths": road[n_lanes : 2 * n_lanes],
@@ -191,7 +197,6 @@ def _stage_numbers(settings: PlannerSettings, layout: StageParameters) -> Any:
     most = ca.vertcat(
         STEP * named["max_curvature_rate"] / SCALES[0], STEP * named["max_jerk"] / SCALES[1]
     )
-    free = ca.logic_and(i < 1, parts["is_driven"] < 1)
     return ca.Function(
         "stage_numbers",
         [ca.vertcat(*parts.values()), moving, before, road, edges, place, theta, limits, i],
