@@ -135,6 +135,7 @@ def with_nominal_deviation(metrics: pd.DataFrame, folder: str | Path) -> pd.Data
 
 
 def run_folders(root: Path) -> list[Path]:
+    """Folders of single runs, below a folder or itself; raises UserError if there are none."""
     if not root.is_dir():
         raise UserError(f"{root}: no such folder, so no runs there; give one written by --out")
     found = sorted(path.parent for path in root.rglob(RUN_FILE))

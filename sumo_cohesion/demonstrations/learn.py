@@ -15,8 +15,11 @@ from sumo_cohesion.learning.tracks import Cutting
 from sumo_cohesion.planning.reward import RewardWeights
 from sumo_cohesion.planning.settings import PlannerSettings
 from sumo_cohesion.simulation.overrides import settings_from
+from sumo_cohesion.user_input import closest
 
 KINDS = get_args(Kind)
+KEEP = {"plans": 0.85, "driven": 0.85, "humans": 0.95}
+"""Share of the segments that the fit is made of, unless told otherwise."""
 SMOOTH = {"plans": (0.0, 0.0), "driven": (0.0, 0.0), "humans": (1.0, 2.0)}
 """Seconds along and across the road, unless told otherwise: planners drive without noise."""
 _OF_THE_SOLVER = {"reward", "solver", "max_iterations", "last_resort", "constraint"}
@@ -33,7 +36,7 @@ def learn(
     desired: str = "limit",
     also: Sequence[str] = (),
     fix: Mapping[str, float] | None = None,
-    keep: float = 0.85,
+    keep: float | None = None,
     hold_out: float = 0.25,
     draws: int = 100,
     overrides: Mapping[str, Any] | None = None,
@@ -57,7 +60,8 @@ def learn(
     desired : "limit", or "own": each driver's own speed is what it would like to drive.
     also : terms to learn that are off by default.
     fix : weights to keep, by name, in units of lane = 1.
-    keep : share of the segments that the fit is made of; those that fit worst are trimmed.
+    keep : share of the segments that the fit is made of; those that fit worst are trimmed. Default:
+        0.85 of a planner's, 0.95 of humans'.
     hold_out : share of the runs that are held out for the comparison with other models.
     draws : of the bootstrap over runs; 0: no intervals.
     overrides : settings of the planner by dotted name, for files; runs bring their own.
@@ -96,7 +100,10 @@ def learn(
         bounded=source == "driven",
     )
     exact = source == "plans" and len(runs) == len(sources)
-    options = Options(keep, dict(fix or {}), hold_out, draws, exact)
+    shown = source if runs else "humans"
+    options = Options(
+        KEEP[shown] if keep is None else keep, dict(fix or {}), hold_out, draws, exact
+    )
     told = [str(path) for path in paths]
     about = {
         "demonstrations": told,
@@ -112,7 +119,7 @@ def _check(
     steps: int | None,
     smooth: tuple[float, float] | None,
     desired: str,
-    keep: float,
+    keep: float | None,
     hold_out: float,
     draws: int,
 ) -> None:
@@ -125,7 +132,7 @@ def _check(
         raise UserError(f"steps {steps}: a segment has 2 to 100 steps of 0.1 s")
     if smooth is not None and not (len(smooth) == 2 and all(0.0 <= s <= 60.0 for s in smooth)):
         raise UserError("smooth: give two times in seconds, along and across the road, e.g. 1,2")
-    if not 0.1 <= keep <= 1.0:
+    if keep is not None and not 0.1 <= keep <= 1.0:
         raise UserError(f"keep {keep:g}: a share of 0.1 to 1")
     if not 0.0 <= hold_out <= 0.9:
         raise UserError(f"hold_out {hold_out:g}: a share of 0 to 0.9")
@@ -135,7 +142,11 @@ def _check(
 
 def _reward(also: Sequence[str]) -> RewardWeights:
     """Return weights that have the terms in use that are to be learned."""
-    return RewardWeights()
+    usual, known = RewardWeights().in_use, list(RewardWeights.model_fields)
+    for name in also:
+        if name not in known:
+            raise UserError(f"also: there is no reward term {name!r}{closest(name, known)}")
+    return RewardWeights(**{name: 1.0 for name in known if name in usual or name in also})
 
 
 def _common_settings(runs: Sequence[Run], overrides: Mapping[str, Any]) -> PlannerSettings:

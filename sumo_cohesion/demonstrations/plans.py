@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Hashable, Mapping
+
 import numpy as np
 import pandas as pd
 
@@ -52,7 +54,7 @@ def plans(
     return found
 
 
-def _unusable(row: dict[str, object], planned: FloatArray) -> str:
+def _unusable(row: Mapping[Hashable, object], planned: FloatArray) -> str:
     if not len(planned):
         return "no plan"
     if row["fallback"] or row["intervened"]:

@@ -176,18 +176,19 @@ def maximise(
         return np.asarray(np.exp(x[0]) * w)
 
     def chain(theta: FloatArray) -> FloatArray:
-        """d theta / d x: (K, 1 + number of free weights)."""
+        """Slope of theta in x: (K, 1 + number of free weights)."""
         columns = np.zeros((len(names), 1 + len(free)))
         columns[:, 0] = theta
         columns[free, np.arange(1, 1 + len(free))] = theta[free]
         return columns
 
-    total = counts @ some.free
+    total = float(counts @ some.free)
 
     def loss(x: FloatArray) -> tuple[float, FloatArray]:
         theta = theta_of(x)
         found = score(some, theta, counts)
-        return -(counts @ found.each) / total, -(found.gradient @ chain(theta)) / total
+        value = -float(counts @ found.each) / total
+        return value, np.asarray(-(found.gradient @ chain(theta)) / total)
 
     def bend(x: FloatArray) -> FloatArray:
         theta = theta_of(x)
@@ -234,7 +235,7 @@ def _errors(curvature: FloatArray) -> FloatArray:
         inverse = np.where(values > 0.0, 1.0 / np.maximum(values, 1e-300), np.inf)
     share = vectors**2
     variance = np.where(share > 1e-12, share * inverse, 0.0).sum(axis=1)
-    return np.sqrt(variance)
+    return np.asarray(np.sqrt(variance))
 
 
 def bootstrap(

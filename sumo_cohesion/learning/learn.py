@@ -16,6 +16,7 @@ from sumo_cohesion.learning.learned import DIGITS, Learned
 from sumo_cohesion.learning.likelihood import Quadratics, quadratics
 from sumo_cohesion.learning.prediction import (
     HORIZONS,
+    VELOCITY,
     best_scale,
     displacements,
     likelihoods,
@@ -97,7 +98,7 @@ def learn_from(
         If nothing can be learned from the sources; the message says why.
     """
     say = progress or _silent
-    settings = settings.model_copy(update={"horizon": how.steps})
+    settings = settings.model_copy(update={"horizon": how.steps, "reward": settings.reward.shape})
     segments, material = _material(_examples(sources, how, say), settings, say)
     for name in options.fixed:
         if name not in material.names:
@@ -150,7 +151,7 @@ def _examples(sources: Sequence[Source], how: Cutting, say: Progress) -> list[Ex
 def _material(
     examples: Sequence[Example], settings: PlannerSettings, say: Progress
 ) -> tuple[Segments, Material]:
-    """Return all segments, with the reason why some are dropped, and what the others are made of."""
+    """Return all segments, each with why it is dropped, and what is made of the others."""
     say("weighing", 0, 1)
     segments = make_segments(examples, settings)
     usable = segments.dropped == ""
@@ -163,7 +164,7 @@ def _material(
     if not (segments.dropped == "").any():
         reasons = "; ".join(f"{reason}: {count}" for reason, count in _counted(segments).items())
         raise UserError(f"nothing can be learned from {len(segments)} segments ({reasons})")
-    names = tuple(RewardWeights.model_fields)
+    names = settings.reward.in_use
     defaults = np.array([getattr(RewardWeights(), name) for name in names])
     chosen = segments.where(segments.dropped == "")
     return segments, Material(chosen, data.where(data.penalty <= 0.0), names, defaults)
@@ -331,26 +332,28 @@ def _warnings(
             f"the median misfit is {middle:.2g}, not about 1: the reward does not describe this "
             "driving"
         )
-    if len(table):
-        by_model = table.set_index("model")
-        told = by_model["log_likelihood"]
-        if told[LEARNED] < told[DEFAULT]:
-            said.append("held-out driving is less likely than with the default weights")
-        last = next((c for c in _FIT_COLUMNS[-2:1:-1] if by_model[c].notna().all(axis=None)), "")
-        walked = [c for c in _FIT_COLUMNS[2:-1] if by_model[c].notna().sum() > 1]
-        del last
-        if (
-            walked
-            and by_model.loc[LEARNED, walked[-1]] > by_model.loc["constant velocity", walked[-1]]
-        ):
-            said.append(
-                f"after {walked[-1].removeprefix('off_')} constant velocity predicts held-out "
-                "driving better"
-            )
+    said += _beaten(table)
     for name, why in found.kept_default.items():
         if name not in options.fixed:
             said.append(f"{name} keeps its default: {why}")
     return tuple(said)
+
+
+def _beaten(table: pd.DataFrame) -> list[str]:
+    """Say where simpler models do better on what was held out."""
+    if not len(table):
+        return []
+    said = []
+    told = dict(zip(table["model"], table["log_likelihood"], strict=True))
+    if told[LEARNED] < told[DEFAULT]:
+        said.append("held-out driving is less likely than with the default weights")
+    for horizon in reversed(HORIZONS):
+        off = dict(zip(table["model"], table[f"off_{horizon:g}s"], strict=True))
+        if not np.isnan(off[LEARNED]):
+            if off[LEARNED] > off[VELOCITY]:
+                said.append(f"{horizon:g} s ahead, constant velocity predicts it better")
+            break
+    return said
 
 
 def _counted(segments: Segments) -> dict[str, int]:

@@ -7,8 +7,8 @@ free controls,
     log p(u | theta) = -1/2 g' A^-1 g + 1/2 log|A| - f/2 log 2 pi.
 
 The reward is theta' phi, so that g and A are sums of each term's own: they are worked out once,
-and the fit needs no reward any more. A is of Gauss-Newton's kind, from the terms as weighted squares
-(planning.reward): positive for every theta > 0.
+and the fit needs no reward any more. A is of Gauss-Newton's kind, from the terms as weighted
+squares (planning.reward): positive for every theta > 0.
 """
 
 from __future__ import annotations
@@ -48,7 +48,9 @@ class Quadratics(NamedTuple):
 
     def where(self, chosen: BoolArray) -> Quadratics:
         """Return those of some segments."""
-        return Quadratics(*[part[chosen] for part in self])
+        return Quadratics(
+            self.gradient[chosen], self.curvature[chosen], self.fixed[chosen], self.penalty[chosen]
+        )
 
 
 class Score(NamedTuple):
@@ -93,11 +95,11 @@ _LANDING = 4
 
 def _lanes_of(segments: Segments, settings: PlannerSettings) -> int:
     """Return the number of lanes that the segments' parameters were written for."""
-    return (segments.stages.shape[2] - StageParameters(settings, 0).size) // 2
+    return int(segments.stages.shape[2] - StageParameters(settings, 0).size) // 2
 
 
 def _stage_functions(settings: PlannerSettings, n_lanes: int) -> tuple[Any, Any]:
-    """Derivatives of one stage.
+    """Write down the derivatives of one stage.
 
     (landing, state, control, parameters) -> every term's gradient in (landing, control before,
     control), (8, K); its Gauss-Newton block, (8, 8 K); the penalties.
@@ -110,9 +112,11 @@ def _stage_functions(settings: PlannerSettings, n_lanes: int) -> tuple[Any, Any]
         residuals, weights, penalty = ca.substitute(near, [stage.relative], [stage.relative_there])
         y = ca.vertcat(stage.landing, stage.state[4:], stage.control)
         jacobian = ca.jacobian(residuals, y)
-        # The weights of the squares are linear in theta: what each term has of them.
+        # The weights of the squares are linear in theta: what each term has of them. Times theta,
+        # which is one, or zero where a stage has no control before it to differ from.
         theta = layout.columns("theta")
         shares = ca.jacobian(weights, stage.parameters)[:, theta]
+        shares = shares * ca.repmat(stage.parameters[theta].T, shares.shape[0], 1)
         slopes, squares = [], []
         for k in range(layout.sizes["theta"]):
             share = shares[:, k]
@@ -148,7 +152,7 @@ def _chained(
 
     ``slope`` (N, T, K, 8), ``square`` (N, T, K, 8, 8), ``move`` (N, T, 6, 8).
     """
-    n, steps, k, width = slope.shape
+    n, steps, k, _ = slope.shape
     size = 2 * steps
     gradient, curvature = np.zeros((n, k, size)), np.zeros((n, k, size, size))
     reach = np.zeros((n, N_STATES, size))  # how the state before depends on all controls

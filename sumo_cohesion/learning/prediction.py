@@ -18,6 +18,7 @@ from sumo_cohesion.state import STEP, BoolArray, Control, FloatArray
 
 HORIZONS = (1.0, 2.0, 3.0)
 """Seconds after which a prediction is compared with what was driven."""
+VELOCITY = "constant velocity"
 WINDOWS = 100
 """Held-out windows that are predicted, at most."""
 
@@ -96,7 +97,7 @@ def displacements(
     rows = []
     for i, example in enumerate(examples):
         predicted = {
-            "constant velocity": _driven_on(example, None, settings),
+            VELOCITY: _driven_on(example, None, settings),
             "constant controls": _driven_on(example, example.driven, settings),
         }
         for name, planner in planners.items():

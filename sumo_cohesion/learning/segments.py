@@ -11,7 +11,6 @@ import pandas as pd
 from sumo_cohesion.learning.example import Example
 from sumo_cohesion.learning.motion import controls
 from sumo_cohesion.planning.problem import Problem
-from sumo_cohesion.planning.reward import RewardWeights
 from sumo_cohesion.planning.settings import PlannerSettings
 from sumo_cohesion.planning.solvers.transcription import Transcription
 from sumo_cohesion.planning.stage import CONTROL_SCALE, UNLIMITED, StageParameters
@@ -69,8 +68,8 @@ def make_segments(examples: Sequence[Example], settings: PlannerSettings) -> Seg
     """Write every example as an instance of the planner's problem.
 
     The road, the cars and their prediction are the planner's own (solvers.transcription).
-    ``settings.horizon`` is the examples' number of steps; of ``settings.reward`` only which terms
-    are in use matters.
+    ``settings.horizon`` is the examples' number of steps; ``settings.reward`` has a weight of one
+    for every term in use.
     """
     n_lanes = max((e.road.lane_centre.shape[1] for e in examples), default=1)
     layout, writer = StageParameters(settings, n_lanes), Transcription(settings, n_lanes)
