@@ -68,17 +68,17 @@ def road_along(
         If the polyline is too short, too long or turns back on itself.
     """
     road = _bare_road(_reference_line(points))
-    strips = [*route]
+    strips = [(column, lane, _strip(road, lane.shape)) for column, lane in route]
+    off = [[(lane, _strip(road, lane.shape)) for lane in lanes] for lanes in exits]
     columns = n_route
-    for k, lanes in zip(_pack([_extent(road, lanes) for lanes in exits]), exits, strict=True):
-        strips += [(n_route + k, lane) for lane in lanes]
+    for k, lanes in zip(_pack([_extent([at for _, (at, _) in w]) for w in off]), off, strict=True):
+        strips += [(n_route + k, lane, beside) for lane, beside in lanes]
         columns = max(columns, n_route + k + 1)
     centre = np.full((road.x.size, columns), np.nan)
     width = np.full_like(centre, np.nan)
     limit = np.full(road.x.size, np.nan)
     ends = []
-    for column, lane in strips:
-        at, d = _strip(road, lane.shape)
+    for column, lane, (at, d) in strips:
         free = np.isnan(centre[at, column])
         centre[at[free], column] = d[free]
         width[at[free], column] = lane.width
@@ -163,10 +163,10 @@ def _bare_road(line: FloatArray) -> Road:
     )
 
 
-def _extent(road: Road, lanes: Sequence[Lane]) -> tuple[int, int]:
-    """First and last vertex of the reference line beside some lanes."""
-    beside = np.concatenate([_strip(road, lane.shape)[0] for lane in lanes])
-    return (int(beside.min()), int(beside.max())) if beside.size else (0, 0)
+def _extent(beside: Sequence[IntArray]) -> tuple[int, int]:
+    """First and last of the vertices of the reference line beside some lanes."""
+    found = np.concatenate(beside)
+    return (int(found.min()), int(found.max())) if found.size else (0, 0)
 
 
 def _pack(extents: list[tuple[int, int]]) -> list[int]:

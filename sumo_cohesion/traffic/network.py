@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -19,6 +19,19 @@ from sumo_cohesion.road_shape import Lane, NoRoadError, blend, road_along
 from sumo_cohesion.state import FloatArray
 from sumo_cohesion.traffic.network_check import check_network
 from sumo_cohesion.traffic.xml_files import check_xml
+
+
+class Edge(NamedTuple):
+    """An edge as cars see it.
+
+    ``lanes`` are the centre lines (n, 2) of its lanes for cars, ``onward`` the names of all edges
+    that they lead to, ``internal`` tells whether it is within a junction.
+    """
+
+    name: str
+    lanes: tuple[FloatArray, ...]
+    onward: frozenset[str]
+    internal: bool = False
 
 
 class Network:
@@ -49,6 +62,25 @@ class Network:
     def edges(self) -> list[str]:
         """Ids of the ordinary (not junction-internal) edges."""
         return [str(e.getID()) for e in self._net.getEdges(withInternal=False)]
+
+    def for_cars(self) -> list[Edge]:
+        """Every edge that cars may use, those within junctions too."""
+        return [
+            Edge(
+                str(edge.getID()),
+                tuple(_shape(lane) for lane in lanes),
+                frozenset(name for lane in lanes for name in self._onward(lane)),
+                edge.getFunction() == "internal",
+            )
+            for edge in self._net.getEdges(withInternal=True)
+            if (lanes := _car_lanes(edge))
+        ]
+
+    def _onward(self, lane: Any) -> Iterator[str]:
+        for connection in lane.getOutgoing():
+            yield str(connection.getToLane().getEdge().getID())
+            if via := connection.getViaLaneID():
+                yield str(self._net.getLane(via).getEdge().getID())
 
     def n_lanes(self, edge: str) -> int:
         """Return the number of lanes of an edge."""
@@ -146,10 +178,11 @@ class Network:
                     cost, _, out, to = min(options, key=lambda o: o[:2])
                     best[i][lane.getID()] = (cost, out, to)
             if not best[i]:
+                edge = edges[i].getID()
                 raise UserError(
                     f"{self.path}: on the ego's route, no lane for cars leads on from edge "
-                    f"{edges[i].getID()!r}; choose another destination or mend its connections"
-                )
+                    f"{edge!r}; choose another destination or mend its connections"
+                ) from NoRoadError(f"has no lane for cars that leads on from edge {edge!r}")
         first = _car_lanes(edges[0])
         lane = min(first, key=lambda o: (best[0][o.getID()][0], o.getIndex()))
         chain = []
