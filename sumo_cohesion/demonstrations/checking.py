@@ -47,7 +47,7 @@ def checked(table: pd.DataFrame, name: str) -> tuple[pd.DataFrame, float]:
         _refuse(frame[column].to_numpy() <= 0.0, table, column, "is not positive", name)
     ids = table["vehicle"].astype("string").fillna("").str.strip()
     _refuse((ids == "").to_numpy(dtype=bool), table, "vehicle", "is empty", name)
-    frame["vehicle"] = ids.astype(str)
+    frame["vehicle"] = ids.astype(str).to_numpy()
     frame = frame.sort_values(["vehicle", "time"], kind="stable", ignore_index=True)
     return frame[list(COLUMNS)], _interval(frame, name)
 

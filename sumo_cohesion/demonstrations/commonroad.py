@@ -51,7 +51,10 @@ def read_commonroad(path: Path) -> Recording:
         )
     try:
         streets = Streets(_lanelets(root))
-        table, others, notes = _obstacles(root, _float(root, "timeStepSize"))
+        step = _float(root, "timeStepSize")
+        if step <= 0.0:
+            raise _SenselessError(f"timeStepSize is {step:g}, which is not positive")
+        table, others, notes = _obstacles(root, step)
     except _SenselessError as error:
         raise UserError(f"{path}: {error}; write it again") from None
     if not streets.edges():

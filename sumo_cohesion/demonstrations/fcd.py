@@ -75,6 +75,7 @@ def read_sumo_table(
                 f"{name}: has no {column!r}; write it with SUMO's "
                 f"--fcd-output.attributes {','.join(_NUMBERS)},type,lane"
             )
+    frame = frame.reset_index(drop=True)
     frame = frame.assign(id=frame["id"].astype("string").fillna("").str.strip().astype(str))
     frame = frame[frame["id"] != ""]  # rows of persons have none
     types = frame["type"].fillna("") if "type" in frame else pd.Series("", index=frame.index)

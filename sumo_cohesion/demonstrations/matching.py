@@ -9,12 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import groupby
+from math import hypot, inf
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from sumo_cohesion.road_shape import arc_length, resample
-from sumo_cohesion.state import FloatArray, IntArray
+from sumo_cohesion.state import FloatArray
 from sumo_cohesion.traffic.network import Edge
 
 SPREAD = 2.0
@@ -113,17 +114,19 @@ class Matcher:
         return found[::-1]
 
 
-def thinned(points: FloatArray, metres: float) -> IntArray:
-    """Choose points (n, 2) of a way about so many metres apart, the first and the last among them.
+def thinned(points: FloatArray, metres: float) -> list[int]:
+    """Choose points (n, 2) of a way so far from each other that noise is no way; return indices.
 
-    Returns
-    -------
-    Their indices.
+    >>> thinned(np.array([(0.0, 0.0), (0.3, 0.1), (2.2, 0.0), (2.1, 0.1), (5.0, 0.0)]), 2.0)
+    [0, 2, 4]
     """
-    marks = np.floor(arc_length(points) / metres)
-    kept = np.flatnonzero(np.diff(marks, prepend=-1.0) > 0.0)
-    last = len(points) - 1
-    return kept if kept[-1] == last else np.append(kept, last)
+    kept: list[int] = []
+    x0 = y0 = inf
+    for k, (x, y) in enumerate(points.tolist()):
+        if hypot(x - x0, y - y0) >= metres:
+            kept.append(k)
+            x0, y0 = x, y
+    return kept
 
 
 def _of_way(places: FloatArray) -> FloatArray:
@@ -131,6 +134,4 @@ def _of_way(places: FloatArray) -> FloatArray:
     if len(places) < 2:
         return np.full(len(places), np.nan)
     along = np.gradient(places, axis=0)
-    heading = np.arctan2(along[:, 1], along[:, 0])
-    heading[np.hypot(along[:, 0], along[:, 1]) < 0.25 * SPREAD] = np.nan
-    return heading
+    return np.arctan2(along[:, 1], along[:, 0])

@@ -100,7 +100,10 @@ def check_fit(points: FloatArray, network: Network, name: str) -> Matcher:
     UserError
         If they are not.
     """
-    matcher = Matcher(network.for_cars())
+    edges = network.for_cars()
+    if not edges:
+        raise UserError(f"{network.path}: has no lanes for cars; give another network")
+    matcher = Matcher(edges)
     off = matcher.away(points) > FARTHEST
     if 2 * int(off.sum()) > len(points):
         raise UserError(
@@ -119,6 +122,9 @@ def _road(passed: Edges, build: Callable[[Edges], Road]) -> Road | str:
         road = build(passed)
     except NoRoadError as error:
         return str(error)
+    except Exception as error:
+        # Lanes that make no sense cause whatever they happen to.
+        return f"drove along lanes that make no road ({type(error).__name__}: {error})"
     # Where a road meets itself, a place beside it can be in two places along it.
     if road.returns(0.0, road.length) is not None:
         return "drove a way that comes back to where it was"

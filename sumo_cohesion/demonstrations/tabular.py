@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import warnings
 import zlib
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
@@ -46,17 +47,24 @@ def read_table(path: Path, text: Collection[str]) -> pd.DataFrame:
     if len(columns) != len(set(columns)):
         raise UserError(f"{path}: two columns have one name; its columns are {', '.join(columns)}")
     try:
-        return pd.read_csv(
-            path,
-            sep=separator,
-            header=0,
-            names=columns,
-            index_col=False,
-            encoding="utf-8-sig",
-            dtype={name: str for name in columns if name in text},
-            keep_default_na=False,
-            na_values={name: _NO_NUMBER for name in columns if name not in text},
-        )
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", pd.errors.ParserWarning)
+            return pd.read_csv(
+                path,
+                sep=separator,
+                header=0,
+                names=columns,
+                index_col=False,
+                encoding="utf-8-sig",
+                dtype={name: str for name in columns if name in text},
+                keep_default_na=False,
+                na_values={name: _NO_NUMBER for name in columns if name not in text},
+            )
+    except pd.errors.ParserWarning:
+        raise UserError(
+            f"{path}: its rows have more values than there are columns; write decimal points, "
+            "not commas"
+        ) from None
     except (ValueError, EOFError, OSError, zlib.error) as error:  # pandas' errors are ValueErrors
         raise UserError(f"{path}: cannot be read as CSV ({error}); write it again") from None
 
