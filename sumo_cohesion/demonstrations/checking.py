@@ -10,6 +10,7 @@ import pandas as pd
 from sumo_cohesion.errors import UserError
 from sumo_cohesion.learning.recording import COLUMNS
 from sumo_cohesion.state import BoolArray, FloatArray
+from sumo_cohesion.traffic.network_check import FARTHEST
 
 SHORTEST, LONGEST = 0.02, 0.2
 """Seconds between two rows of a vehicle: what controls of STEP (state.py) can be made of."""
@@ -43,6 +44,9 @@ def checked(table: pd.DataFrame, name: str) -> tuple[pd.DataFrame, float]:
     frame = pd.DataFrame({column: _as_floats(table[column]) for column in numbers})
     for column in numbers:
         _refuse(~np.isfinite(frame[column].to_numpy()), table, column, "is not a number", name)
+    for column in ("x", "y"):
+        far = np.abs(frame[column].to_numpy()) > FARTHEST
+        _refuse(far, table, column, "is nowhere on Earth", name)
     for column in ("length", "width"):
         _refuse(frame[column].to_numpy() <= 0.0, table, column, "is not positive", name)
     ids = table["vehicle"].astype("string").fillna("").str.strip()

@@ -21,7 +21,9 @@ from sumo_cohesion.demonstrations.matching import Matcher
 from sumo_cohesion.demonstrations.roads import roads_driven, ways
 from sumo_cohesion.errors import UserError
 from sumo_cohesion.learning.recording import Recording
+from sumo_cohesion.road_shape import LONGEST_ROUTE, arc_length
 from sumo_cohesion.state import FloatArray
+from sumo_cohesion.traffic.network_check import FARTHEST
 from sumo_cohesion.traffic.xml_files import check_xml
 
 VERSIONS = ("2018b", "2020a")
@@ -92,7 +94,12 @@ def _points(element: ET.Element | None, whose: str) -> FloatArray:
     found = [] if element is None else element.findall("point")
     if len(found) < 2:
         raise _SenselessError(f"{whose} has no bound of two points or more")
-    return np.array([(_float(p, "x"), _float(p, "y")) for p in found])
+    points = np.array([(_float(p, "x"), _float(p, "y")) for p in found])
+    if arc_length(points)[-1] > LONGEST_ROUTE:
+        raise _SenselessError(f"{whose} has a bound longer than {LONGEST_ROUTE / 1e3:g} km")
+    if np.abs(points).max() > FARTHEST:
+        raise _SenselessError(f"{whose} is nowhere on Earth")
+    return points
 
 
 def _lanelets(root: ET.Element) -> dict[str, Lanelet]:

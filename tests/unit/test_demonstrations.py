@@ -508,6 +508,7 @@ class TestChecked:
             (at(4, np.nan, "x"), "f: row 5: x is not a number (nan); mend it or take the row out"),
             (at(7, "far", "y"), "f: row 8: y is not a number (far); mend it or take the row out"),
             (at(0, np.inf, "time"), "f: row 1: time is not a number (inf)"),
+            (at(3, -1e9, "y"), "f: row 4: y is nowhere on Earth (-1000000000.0)"),
             (at(2, 0.0, "length"), "f: row 3: length is not positive (0.0)"),
             (at(2, " ", "vehicle"), "f: row 3: vehicle is empty; mend it"),
             (at(2, None, "vehicle"), "f: row 3: vehicle is empty; mend it"),
@@ -609,6 +610,11 @@ class TestBadFiles:
                 "f.xml",
                 scene().replace("<x>0.000000000</x>", "<x>nan</x>", 1),
                 ": in <point>, x is 'nan', which is no number; write it again",
+            ),
+            (
+                "f.xml",
+                scene().replace("<x>0.000000000</x>", "<x>1e12</x>", 1),
+                ": lanelet 1 has a bound longer than 300 km; write it again",
             ),
             (
                 "f.xml",
