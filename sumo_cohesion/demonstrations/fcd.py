@@ -84,8 +84,8 @@ def read_sumo_table(
         {
             "time": frame["time"],
             "vehicle": frame["id"],
-            "length": types.map({t: kind.length for t, kind in kinds.items()}),
-            "width": types.map({t: kind.width for t, kind in kinds.items()}),
+            "length": np.array([kinds[t].length for t in types]),
+            "width": np.array([kinds[t].width for t in types]),
         }
     )
     x, y, angle = (pd.to_numeric(frame[n], errors="coerce").to_numpy(float) for n in _NUMBERS)

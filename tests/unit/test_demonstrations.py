@@ -545,6 +545,7 @@ class TestChecked:
 
 HEADER = "time,vehicle,x,y\n"
 FCD = '<fcd-export><timestep time="0.0">{}</timestep></fcd-export>'
+FCD_COLUMNS = ["timestep_time", *(f"vehicle_{n}" for n in ("id", "x", "y", "angle", "lane"))]
 CAR_1 = '<vehicle id="a" x="5" y="-1.75" angle="90" lane="west_2"/>'
 
 
@@ -574,6 +575,8 @@ class TestBadFiles:
                 FCD.format(CAR_1).replace("</fcd", FCD[12:].format(CAR_1)[:-13] + "</fcd"),
                 ": overlapping ids: vehicle 'a' is there twice at 0 s",
             ),
+            ("f.csv", ";".join(FCD_COLUMNS), ": holds no vehicles; write it again"),
+            ("f.csv", ";".join(FCD_COLUMNS[:-1]), ": has no 'lane'; write it with SUMO's"),
             ("f.csv", "", ": has no column 'time'; it needs time, vehicle, x, y"),
             ("f.csv", HEADER, ": holds no vehicles; write it again"),
             ("f.csv", "time,vehicel,x,y\n", ": unknown column 'vehicel'; did you mean 'vehicle'?"),
