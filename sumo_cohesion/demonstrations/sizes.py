@@ -82,10 +82,12 @@ def kinds_of(
         kinds[name] = CAR if known is None else _kind(known, written)
     if not unknown:
         return kinds, []
-    shown = ", ".join(unknown[:3]) + (", …" if unknown[3:] else "")
+    named = [name for name in unknown if name]
+    shown = ", ".join(named[:3]) + (", …" if named[3:] else "")
+    whose = f"vehicles of the types {shown}" if named else "its vehicles"
     return kinds, [
-        f"it does not say how long vehicles of the types {shown} are: taken for cars of "
-        f"{CAR.length:g} x {CAR.width:g} m (the route files that have the types would tell)"
+        f"it does not say how long {whose} are: taken for cars of {CAR.length:g} x {CAR.width:g} m "
+        "(the route files that have the types would tell)"
     ]
 
 

@@ -191,6 +191,7 @@ class TestFloatingCarData:
         path.write_text(f"<fcd-export>{''.join(rows)}</fcd-export>")
         found = read_fcd(path, network)
         assert_same_road(found.roads["a"], road)
+        assert found.notes[0].startswith("it does not say how long its vehicles are: taken for")
 
     def test_default_sizes_are_those_of_sumo(self, tmp_path: Path) -> None:
         types = "".join(f'<vType id="of_{name}" vClass="{name}"/>' for name in BY_CLASS)
