@@ -13,9 +13,10 @@ import pytest
 PACKAGE = Path(__file__).resolve().parent.parent / "sumo_cohesion"
 
 # What a module of a room may load, directly or through others; besides its own room.
-SHARED = {"errors", "locks", "state", "road", "user_input", "versions"}
+SHARED = {"errors", "locks", "state", "road", "road_shape", "user_input", "versions"}
 ONE_CAR = SHARED | {"perception", "social", "planning"}
 RUN = ONE_CAR | {"traffic", "tables", "simulation"}
+LEARN = {"learning", "demonstrations"}
 ALLOWED = {
     "errors": set(),
     "locks": set(),
@@ -23,6 +24,7 @@ ALLOWED = {
     "state": set(),
     "user_input": {"errors"},
     "road": {"state"},
+    "road_shape": {"road", "state"},
     "traffic": SHARED,
     "perception": SHARED,
     "social": SHARED | {"perception"},
@@ -30,10 +32,12 @@ ALLOWED = {
     "tables": {"errors", "state"},
     "simulation": RUN,
     "batches": RUN,
+    "learning": SHARED | {"planning", "perception", "social", "tables"},
+    "demonstrations": RUN | {"learning", "batches"},
     "report": {"errors", "state", "tables"},
-    "cli": RUN | {"batches", "report", "__init__"},
-    "__main__": RUN | {"batches", "report", "cli"},
-    "__init__": RUN | {"batches"},
+    "cli": RUN | {"batches", "report", "__init__"} | LEARN,
+    "__main__": RUN | {"batches", "report", "cli"} | LEARN,
+    "__init__": RUN | {"batches"} | LEARN,
 }
 OUTSIDE = {
     "libsumo": {"traffic"},

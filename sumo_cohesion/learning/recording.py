@@ -25,9 +25,11 @@ class Recording:
     roads : the road that each vehicle drove along, in the table's coordinates. Only vehicles that
         have one demonstrate; all others are merely driven around.
     interval : seconds between two rows of a vehicle.
+    notes : what there is to say about it, one line each.
     """
 
     name: str
     table: pd.DataFrame
     roads: Mapping[str, Road]
     interval: float
+    notes: tuple[str, ...] = ()

@@ -7,30 +7,31 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.ndimage import gaussian_filter1d
 
 from sumo_cohesion.errors import UserError
-from sumo_cohesion.road import SPACING, Road
-from sumo_cohesion.state import FloatArray, IntArray
+from sumo_cohesion.road import Road
+from sumo_cohesion.road_shape import Lane, NoRoadError, blend, road_along
+from sumo_cohesion.state import FloatArray
 from sumo_cohesion.traffic.network_check import check_network
 from sumo_cohesion.traffic.xml_files import check_xml
 
-EXTENSION = 100.0
-"""Straight metres added to both ends of the reference line, so that cars near them project."""
-_APART = round(100.0 / SPACING)
-"""Vertices between two exits in one column: farther than from one car to another in its lane."""
-LONGEST_ROUTE = 300_000.0
-"""Metres of the ego's route at most: its road takes half a gigabyte then."""
-SMOOTHING = 4.0
-"""Standard deviation (m) of the filter that rounds the kinks of a polyline. It moves a curve of
-radius R inwards by SMOOTHING²/2R (2 cm at 400 m); the lanes, measured in the same frame, are
-where they were."""
+
+class Edge(NamedTuple):
+    """An edge as cars see it.
+
+    ``lanes`` are the centre lines (n, 2) of its lanes for cars, ``onward`` the names of all edges
+    that they lead to, ``internal`` tells whether it is within a junction.
+    """
+
+    name: str
+    lanes: tuple[FloatArray, ...]
+    onward: frozenset[str]
+    internal: bool = False
 
 
 class Network:
@@ -61,6 +62,25 @@ class Network:
     def edges(self) -> list[str]:
         """Ids of the ordinary (not junction-internal) edges."""
         return [str(e.getID()) for e in self._net.getEdges(withInternal=False)]
+
+    def for_cars(self) -> list[Edge]:
+        """Every edge that cars may use, those within junctions too."""
+        return [
+            Edge(
+                str(edge.getID()),
+                tuple(_shape(lane) for lane in lanes),
+                frozenset(name for lane in lanes for name in self._onward(lane)),
+                edge.getFunction() == "internal",
+            )
+            for edge in self._net.getEdges(withInternal=True)
+            if (lanes := _car_lanes(edge))
+        ]
+
+    def _onward(self, lane: Any) -> Iterator[str]:
+        for connection in lane.getOutgoing():
+            yield str(connection.getToLane().getEdge().getID())
+            if via := connection.getViaLaneID():
+                yield str(self._net.getLane(via).getEdge().getID())
 
     def n_lanes(self, edge: str) -> int:
         """Return the number of lanes of an edge."""
@@ -104,8 +124,9 @@ class Network:
         edges = [self._edge(e) for e in route]
         with self._readable(f"along the route from edge {route[0]!r} to edge {route[-1]!r}"):
             chain = self._lane_chain(edges)
-            line = _reference_line(self._chain_shape(chain))
-            return self._with_lanes(_bare_road(line), edges)
+            lanes, exits = self._lanes_beside(edges)
+            n_route = max(e.getLaneNumber() for e in edges)
+            return road_along(self._chain_shape(chain), lanes, n_route, exits)
 
     @contextmanager
     def _readable(self, where: str) -> Iterator[None]:
@@ -114,6 +135,8 @@ class Network:
             yield
         except UserError:
             raise
+        except NoRoadError as error:
+            raise UserError(f"the ego's route {error}; choose another destination") from error
         except Exception as error:
             raise UserError(
                 f"{self.path}: no road can be made of it {where} ({type(error).__name__}: "
@@ -155,10 +178,11 @@ class Network:
                     cost, _, out, to = min(options, key=lambda o: o[:2])
                     best[i][lane.getID()] = (cost, out, to)
             if not best[i]:
+                edge = edges[i].getID()
                 raise UserError(
                     f"{self.path}: on the ego's route, no lane for cars leads on from edge "
-                    f"{edges[i].getID()!r}; choose another destination or mend its connections"
-                )
+                    f"{edge!r}; choose another destination or mend its connections"
+                ) from NoRoadError(f"has no lane for cars that leads on from edge {edge!r}")
         first = _car_lanes(edges[0])
         lane = min(first, key=lambda o: (best[0][o.getID()][0], o.getIndex()))
         chain = []
@@ -172,7 +196,7 @@ class Network:
         """Polyline (n, 2) of a chain of lanes and the junction-internal lanes between them."""
         pieces = []
         for i, (enter, leave) in enumerate(chain):
-            pieces.append(_blend(_shape(enter), _shape(leave)) if enter != leave else _shape(enter))
+            pieces.append(blend(_shape(enter), _shape(leave)) if enter != leave else _shape(enter))
             if i + 1 < len(chain):
                 pieces.extend(_shape(via) for via in self._internal(leave, chain[i + 1][0]))
         return np.concatenate(pieces)
@@ -188,59 +212,24 @@ class Network:
             connection = next(iter(via.getOutgoing()), None)
         return lanes
 
-    def _with_lanes(self, road: Road, edges: list[Any]) -> Road:
-        """Measure every lane on, and every exit off, the route in the road's own frame."""
-        n_route = max(e.getLaneNumber() for e in edges)
-        strips: list[tuple[int, list[Any]]] = []
-        exits: list[list[Any]] = []
+    def _lanes_beside(self, edges: list[Any]) -> tuple[list[tuple[int, Lane]], list[list[Lane]]]:
+        """Return every lane on a route, with its column, and the lanes of every exit off it."""
+        route: list[tuple[int, Lane]] = []
+        exits: list[list[Lane]] = []
         for edge, following in zip(edges, [*edges[1:], None], strict=True):
             for lane in _car_lanes(edge):
-                strips.append((lane.getIndex(), [lane]))
+                limit, last = float(lane.getSpeed()), edge == edges[-1]
+                route.append((lane.getIndex(), Lane(_shape(lane), lane.getWidth(), limit, last)))
                 for connection in lane.getOutgoing():
                     to = connection.getToLane()
                     if not to.allows("passenger"):
                         continue
-                    via = self._internal(lane, to)
+                    via = [Lane(_shape(v), v.getWidth()) for v in self._internal(lane, to)]
                     if to.getEdge() == following:
-                        strips.append((to.getIndex(), via))
+                        route += [(to.getIndex(), piece) for piece in via]
                     elif connection.getDirection() != connection.LINKDIR_TURN:
-                        exits.append([*via, to])
-        columns = n_route
-        for k, lanes in zip(_pack([_extent(road, lanes) for lanes in exits]), exits, strict=True):
-            strips.append((n_route + k, lanes))
-            columns = max(columns, n_route + k + 1)
-        centre = np.full((road.x.size, columns), np.nan)
-        width = np.full_like(centre, np.nan)
-        limit = np.full(road.x.size, np.nan)
-        ends = []
-        for column, lanes in strips:
-            for lane in lanes:
-                at, d = _strip(road, _shape(lane))
-                free = np.isnan(centre[at, column])
-                centre[at[free], column] = d[free]
-                width[at[free], column] = lane.getWidth()
-                if column < n_route and lane.getEdge().getFunction() != "internal":
-                    limit[at] = np.fmax(limit[at], lane.getSpeed())
-                    if lane.getEdge() == edges[-1]:
-                        ends.append(at[-1])
-        if not ends:
-            raise UserError(
-                f"{self.path}: along the ego's route its own lanes cannot be found; it turns back "
-                "on itself; choose another destination"
-            )
-        last = max(ends)
-        first = round(-road.s0 / SPACING)
-        for values in (centre[:, :n_route], width[:, :n_route], limit[:, None]):
-            values[:first] = values[first]
-            values[last:] = values[last]
-        return replace(
-            road,
-            length=road.s0 + last * SPACING,
-            lane_centre=centre,
-            lane_width=width,
-            speed_limit=_filled(limit),
-            n_route_lanes=n_route,
-        )
+                        exits.append([*via, Lane(_shape(to), to.getWidth())])
+        return route, exits
 
 
 def _car_lanes(edge: Any) -> list[Any]:
@@ -249,114 +238,3 @@ def _car_lanes(edge: Any) -> list[Any]:
 
 def _shape(lane: Any) -> FloatArray:
     return np.asarray([p[:2] for p in lane.getShape()], dtype=float)
-
-
-def _arc_length(points: FloatArray) -> FloatArray:
-    steps = np.diff(points, axis=0)
-    return np.concatenate(([0.0], np.cumsum(np.hypot(steps[:, 0], steps[:, 1]))))
-
-
-def _resample(points: FloatArray, n: int) -> FloatArray:
-    """Return n points at equal arc length along a polyline, both ends kept."""
-    s = _arc_length(points)
-    at = np.linspace(0.0, s[-1], n)
-    return np.column_stack((np.interp(at, s, points[:, 0]), np.interp(at, s, points[:, 1])))
-
-
-def _blend(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Polyline that leaves one lane at its start and reaches another at its end."""
-    n = max(int(_arc_length(a)[-1]), 2)
-    u = np.linspace(0.0, 1.0, n)[:, None]
-    share = u * u * (3.0 - 2.0 * u)
-    return (1.0 - share) * _resample(a, n) + share * _resample(b, n)
-
-
-def _reference_line(points: FloatArray) -> FloatArray:
-    """Smooth line (G, 2) with a vertex every SPACING m, extended straight at both ends."""
-    length = _arc_length(points)[-1]
-    if length < 3 * SPACING:
-        raise UserError("the ego's route is shorter than 3 m; choose another destination")
-    if length > LONGEST_ROUTE:
-        raise UserError(
-            f"the ego's route is {length / 1e3:.0f} km long, more than {LONGEST_ROUTE / 1e3:g} km; "
-            "choose another destination"
-        )
-    line = _resample(points, round(length / SPACING) + 1)
-    head, tail = line[0] - line[1], line[-1] - line[-2]
-    steps = np.arange(1.0, EXTENSION / SPACING + 1)[:, None]
-    head, tail = (steps * v * SPACING / np.hypot(*v) for v in (head, tail))
-    line = np.concatenate((line[0] + head[::-1], line, line[-1] + tail))
-    smooth = np.asarray(gaussian_filter1d(line, SMOOTHING / SPACING, axis=0, mode="nearest"))
-    # The filter needs neighbours on both sides; the straight ends do not need the filter.
-    margin = int(EXTENSION / SPACING) // 2
-    smooth[:margin], smooth[-margin:] = line[:margin], line[-margin:]
-    return _resample(smooth, round(_arc_length(smooth)[-1] / SPACING) + 1)
-
-
-def _bare_road(line: FloatArray) -> Road:
-    """Road with a reference line (G, 2) but no lanes yet."""
-    tangent = np.gradient(line, axis=0)
-    tangent /= np.hypot(tangent[:, 0], tangent[:, 1])[:, None]
-    heading = np.unwrap(np.arctan2(tangent[:, 1], tangent[:, 0]))
-    return Road(
-        x=line[:, 0].copy(),
-        y=line[:, 1].copy(),
-        tangent_x=tangent[:, 0].copy(),
-        tangent_y=tangent[:, 1].copy(),
-        curvature=np.gradient(heading, SPACING),
-        s0=-EXTENSION,
-        length=(len(line) - 1) * SPACING - 2 * EXTENSION,
-        lane_centre=np.full((len(line), 1), np.nan),
-        lane_width=np.full((len(line), 1), np.nan),
-        speed_limit=np.full(len(line), np.nan),
-        n_route_lanes=1,
-    )
-
-
-def _extent(road: Road, lanes: list[Any]) -> tuple[int, int]:
-    """First and last vertex of the reference line beside some lanes."""
-    beside = np.concatenate([_strip(road, _shape(lane))[0] for lane in lanes])
-    return (int(beside.min()), int(beside.max())) if beside.size else (0, 0)
-
-
-def _pack(extents: list[tuple[int, int]]) -> list[int]:
-    """Give each of some extents (first, last) a column, the first in which none is near it.
-
-    >>> _pack([(0, 9), (5, 20), (150, 190), (160, 170)])
-    [0, 1, 0, 1]
-    """
-    columns: list[list[tuple[int, int]]] = []
-    chosen = []
-    for first, last in extents:
-        free = (
-            k
-            for k, taken in enumerate(columns)
-            if all(last + _APART < a or b + _APART < first for a, b in taken)
-        )
-        k = next(free, len(columns))
-        if k == len(columns):
-            columns.append([])
-        columns[k].append((first, last))
-        chosen.append(k)
-    return chosen
-
-
-def _strip(road: Road, shape: FloatArray) -> tuple[IntArray, FloatArray]:
-    """Vertices of the reference line beside a lane, and the lane centre's d (m) at each."""
-    n = max(int(_arc_length(shape)[-1] / SPACING) + 1, 2)
-    points = _resample(shape, n)
-    frenet, _ = road.to_frenet(np.column_stack((points, np.zeros((n, 2)))))
-    order = np.argsort(frenet[:, 0], kind="stable")
-    s, d = frenet[order, 0], frenet[order, 1]
-    # Half a vertex beyond each end, so that lanes that abut leave no gap between them.
-    first = int(np.ceil((s[0] - road.s0) / SPACING - 0.5))
-    last = int(np.floor((s[-1] - road.s0) / SPACING + 0.5))
-    at = np.arange(max(first, 0), min(last, road.x.size - 1) + 1)
-    return at, np.interp(road.s0 + at * SPACING, s, d)
-
-
-def _filled(values: FloatArray) -> FloatArray:
-    """Carry known values forward into gaps (a junction keeps the limit of the edge before)."""
-    known = np.flatnonzero(~np.isnan(values))
-    previous = np.searchsorted(known, np.arange(values.size), side="right") - 1
-    return values[known[np.maximum(previous, 0)]]

@@ -75,6 +75,11 @@ class VehicleTypes:
         """Return the type of that name; None if no file has it."""
         return self._types.get(name)
 
+    def vehicle_class(self, name: str) -> str:
+        """SUMO's class (vClass) of a type; that of cars if nothing says otherwise."""
+        kind = self._types.get(name, ET.Element("vType"))
+        return kind.get("vClass", _BUILT_IN.get(name, "passenger"))
+
     def is_distribution(self, name: str) -> bool:
         """Tell whether a name is that of a distribution of types."""
         return name in self._distributions
@@ -110,7 +115,7 @@ class VehicleTypes:
             If it cannot be understood.
         """
         kind = self._types.get(name, ET.Element("vType"))
-        vehicle_class = kind.get("vClass", _BUILT_IN.get(name, "passenger"))
+        vehicle_class = self.vehicle_class(name)
         mean, deviation = kind.get("speedFactor", "1.0"), kind.get("speedDev")
         try:
             factor = _parsed(mean, _usual_deviation(vehicle_class))

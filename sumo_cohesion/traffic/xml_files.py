@@ -10,6 +10,7 @@ import re
 import xml.etree.ElementTree as ET
 import zlib
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from functools import lru_cache
 from io import BufferedReader
 from pathlib import Path
@@ -52,9 +53,46 @@ def parse_xml(path: Path) -> ET.Element:
     UserError
         If the file is missing, unreadable, damaged or not well-formed.
     """
+    with _one_line(path), _opened(path) as file:
+        return ET.parse(file).getroot()
+
+
+def each_element(path: Path, root: str, tag: str) -> Iterator[ET.Element]:
+    """Elements of a tag right below the root, each thrown away after use: the file may be long.
+
+    Raises
+    ------
+    UserError
+        As `check_xml` does, when it comes to what is wrong.
+    """
+    with _one_line(path), _opened(path) as file:
+        top: ET.Element | None = None
+        for event, element in ET.iterparse(file, events=("start", "end")):
+            if top is None:
+                top = _of_kind(element, root, path)
+            elif event == "end" and element.tag == tag:
+                yield element
+                top.clear()
+
+
+def root_of(path: Path) -> str:
+    """Name of a file's root element; of the file no more is read.
+
+    Raises
+    ------
+    UserError
+        If the file is missing, unreadable, damaged or not well-formed up to there.
+    """
+    with _one_line(path), _opened(path) as file:
+        _, element = next(iter(ET.iterparse(file, events=("start",))))
+        return str(element.tag)
+
+
+@contextmanager
+def _one_line(path: Path) -> Iterator[None]:
+    """Turn whatever reading an XML file causes into one line."""
     try:
-        with _opened(path) as file:
-            return ET.parse(file).getroot()
+        yield
     except (gzip.BadGzipFile, EOFError, zlib.error) as error:
         raise UserError(
             f"{path}: gzipped, but truncated or damaged ({error}); write it again"
@@ -84,7 +122,10 @@ def check_xml(path: Path, root: str) -> ET.Element:
     UserError
         If the file is missing, unreadable, not well-formed or of another kind.
     """
-    element = parse_xml(path)
+    return _of_kind(parse_xml(path), root, path)
+
+
+def _of_kind(element: ET.Element, root: str, path: Path) -> ET.Element:
     if element.tag != root:
         raise UserError(f"{path}: its root element is <{element.tag}>, expected <{root}>")
     return element

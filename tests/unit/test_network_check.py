@@ -174,7 +174,7 @@ def test_whatever_else_a_network_causes_is_one_line(
     highway: object, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     network = Network(ROOT / "networks" / "highway.net.xml")
-    monkeypatch.setattr("sumo_cohesion.traffic.network._bare_road", None)
+    monkeypatch.setattr("sumo_cohesion.road_shape._bare_road", None)
     with pytest.raises(
         UserError, match=r"'west' to edge 'east' \(TypeError: .*netconvert"
     ) as error:

@@ -123,7 +123,7 @@ def test_a_way_through_a_city_has_few_columns_of_lanes(
     network = Network(city)
     route = network.route("A0A1", "G7H7")
     road = network.road(route)
-    monkeypatch.setattr("sumo_cohesion.traffic.network._pack", lambda extents: range(len(extents)))
+    monkeypatch.setattr("sumo_cohesion.road_shape._pack", lambda extents: range(len(extents)))
     apart = network.road(route)
     assert len(route) > 12
     assert apart.lane_centre.shape[1] > 30
