@@ -104,6 +104,7 @@ def batch(
         about = {
             "experiment": asked.model_dump(mode="json"),
             "grid": list(asked.grid),
+            "files": work.files,
             "versions": versions(),
         }
         store.write_plan(work.plan, about)
