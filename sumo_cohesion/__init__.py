@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from sumo_cohesion.batches.batch import batch
     from sumo_cohesion.batches.comparison import Comparison, compare
     from sumo_cohesion.batches.results import load_metrics, load_rollout, load_trajectories
+    from sumo_cohesion.batches.tuning import Tuning, tune
     from sumo_cohesion.errors import SimulationError, UserError
     from sumo_cohesion.planning.planners import Planner
     from sumo_cohesion.simulation.episode import Episode
@@ -35,6 +36,7 @@ _HOME = {
     "Rollout": "tables.rollout",
     "RunRequest": "simulation.request",
     "SimulationError": "errors",
+    "Tuning": "batches.tuning",
     "UserError": "errors",
     "batch": "batches.batch",
     "compare": "batches.comparison",
@@ -46,6 +48,7 @@ _HOME = {
     "load_trajectories": "batches.results",
     "prepare": "simulation.setup",
     "run": "simulation.run",
+    "tune": "batches.tuning",
 }
 
 __all__ = [
@@ -59,6 +62,7 @@ __all__ = [
     "Rollout",
     "RunRequest",
     "SimulationError",
+    "Tuning",
     "UserError",
     "batch",
     "compare",
@@ -70,6 +74,7 @@ __all__ = [
     "load_trajectories",
     "prepare",
     "run",
+    "tune",
 ]
 
 
