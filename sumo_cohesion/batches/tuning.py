@@ -106,7 +106,7 @@ def tune(
     _check(metric, target, planner)
     numbers = parse_seeds(seeds, "seeds")
     where = f"{Path(scenario).name}, seeds {_range(numbers)}"
-    file = None if weights is None else WeightsFile.read(Path(weights))
+    file = None if weights is None else _file(Path(weights))
     settings = _settings(overrides or {}, weights)
     tried: list[dict[str, float]] = []
 
@@ -136,7 +136,8 @@ def tune(
         raise NotReachedError(f"{where}: {metric} {error}") from None
     table = pd.DataFrame(tried).sort_values("beta", ignore_index=True)
     value = float(table["value"][table["beta"] == beta].iloc[0])
-    said = f"{metric} {value:.3f} for {target:g} with {planner} in {where}"
+    given = "".join(f", {name}={value}" for name, value in (overrides or {}).items())
+    said = f"{metric} {value:.3f} for {target:g} with {planner} in {where}{given}"
     if file is not None:
         file.write_beta(beta, said)
     return Tuning(beta, table, abs(value - target) <= TOLERANCE, said)
@@ -195,6 +196,12 @@ def _check(metric: str, target: float, planner: str) -> None:
     with_beta = [name for name in BUILT_IN if name not in WITHOUT_COHESION]
     if planner not in with_beta:
         raise UserError(f"planner {planner!r} has no beta; tune {' or '.join(with_beta)}")
+
+
+def _file(path: Path) -> WeightsFile:
+    if path.suffix != ".toml" and not path.exists():
+        raise UserError(f"{path}: no such file of weights; a scenario is named by --scenario")
+    return WeightsFile.read(path)
 
 
 def _settings(overrides: Mapping[str, Any], weights: str | Path | None) -> dict[str, Any]:

@@ -39,6 +39,7 @@ def test_the_tuned_beta_closes_the_share_that_was_asked_for(
     assert "no evidence" in err
     assert "--set planner.reward=@theta.toml --set cohesion.beta=@theta.toml" in err
     assert path.read_text().startswith(THETA + "\n[cohesion]\nbeta = ")
+    assert path.read_text().endswith("with cohesive in speeding, seeds 1000:1003, duration=16.0\n")
 
     files = {"planner.reward": "@theta.toml", "cohesion.beta": "@theta.toml"}
     runs = sc.compare("speeding", "cohesive", "1000:1003", overrides=SHORT | files).runs
@@ -84,6 +85,7 @@ def test_what_is_not_defined_or_not_reached_is_one_line(invoke: Invoke) -> None:
 
 def test_what_is_wrong_with_the_file_is_told_before_anything_is_driven(invoke: Invoke) -> None:
     assert_one_line(invoke("tune", "theta.toml"), "theta.toml: cannot be read", "No such file")
+    assert_one_line(invoke("tune", "speeding"), "no such file of weights", "--scenario")
     Path("theta.toml").write_text("[learned]\nn = 1\n")
     assert_one_line(invoke("tune", "theta.toml"), "has no planner.reward; it has learned")
     Path("theta.toml").write_text(THETA + "[cohesion]\nbeta = 1.0\n")
