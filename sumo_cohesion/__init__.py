@@ -12,7 +12,10 @@ if TYPE_CHECKING:
     from sumo_cohesion.batches.batch import batch
     from sumo_cohesion.batches.comparison import Comparison, compare
     from sumo_cohesion.batches.results import load_metrics, load_rollout, load_trajectories
+    from sumo_cohesion.batches.tuning import Tuning, tune
+    from sumo_cohesion.demonstrations.learn import learn
     from sumo_cohesion.errors import SimulationError, UserError
+    from sumo_cohesion.learning.learned import Learned
     from sumo_cohesion.planning.planners import Planner
     from sumo_cohesion.simulation.episode import Episode
     from sumo_cohesion.simulation.export import export_scenario
@@ -28,6 +31,7 @@ _HOME = {
     "Comparison": "batches.comparison",
     "Control": "state",
     "Episode": "simulation.episode",
+    "Learned": "learning.learned",
     "Observation": "state",
     "Plan": "state",
     "Planner": "planning.planners",
@@ -35,23 +39,27 @@ _HOME = {
     "Rollout": "tables.rollout",
     "RunRequest": "simulation.request",
     "SimulationError": "errors",
+    "Tuning": "batches.tuning",
     "UserError": "errors",
     "batch": "batches.batch",
     "compare": "batches.comparison",
     "compare_planners": "tables.paired",
     "export_scenario": "simulation.export",
+    "learn": "demonstrations.learn",
     "load_metrics": "batches.results",
     "load_rollout": "batches.results",
     "load_scenario": "simulation.scenario",
     "load_trajectories": "batches.results",
     "prepare": "simulation.setup",
     "run": "simulation.run",
+    "tune": "batches.tuning",
 }
 
 __all__ = [
     "Comparison",
     "Control",
     "Episode",
+    "Learned",
     "Observation",
     "Plan",
     "Planner",
@@ -59,17 +67,20 @@ __all__ = [
     "Rollout",
     "RunRequest",
     "SimulationError",
+    "Tuning",
     "UserError",
     "batch",
     "compare",
     "compare_planners",
     "export_scenario",
+    "learn",
     "load_metrics",
     "load_rollout",
     "load_scenario",
     "load_trajectories",
     "prepare",
     "run",
+    "tune",
 ]
 
 

@@ -105,6 +105,7 @@ def batch(
             "experiment": asked.model_dump(mode="json"),
             "folder": str(asked.folder),
             "grid": list(asked.grid),
+            "files": work.files,
             "versions": versions(),
         }
         store.write_plan(work.plan, about)

@@ -22,6 +22,7 @@ from sumo_cohesion.batches.workers import (
 )
 from sumo_cohesion.errors import SimulationError, UserError
 from sumo_cohesion.planning.registry import AnyPlanner, planner_name
+from sumo_cohesion.simulation.overrides import read_files
 from sumo_cohesion.simulation.request import RunRequest
 from sumo_cohesion.simulation.run import record
 from sumo_cohesion.simulation.setup import prepare
@@ -115,7 +116,8 @@ def compare(
             refuse_repeats(values)
         except ValueError as error:
             raise UserError(f"{what} {error}") from None
-    requests = [RunRequest(str(scenario), p, s, overrides or {}) for p in planners for s in seeds]
+    settings = read_files(overrides or {})  # once, so that all runs have the same
+    requests = [RunRequest(str(scenario), p, s, settings) for p in planners for s in seeds]
     ends = {min(seeds), max(seeds)}
     for request in requests:
         if request.seed in ends:
@@ -124,7 +126,7 @@ def compare(
         "scenario": str(scenario),
         "planners": [planner_name(planner) for planner in planners],
         "seeds": list(seeds),
-        "overrides": dict(overrides or {}),
+        "overrides": settings,
     }
     text = json.dumps(about, indent=2, default=_plain) + "\n"
     with stopped_by_signals():

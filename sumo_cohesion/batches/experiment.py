@@ -25,6 +25,7 @@ from sumo_cohesion.batches.identity import point_digest, run_key
 from sumo_cohesion.batches.store import Value, as_cell
 from sumo_cohesion.errors import UserError
 from sumo_cohesion.planning.registry import check_planner
+from sumo_cohesion.simulation.overrides import read_files
 from sumo_cohesion.simulation.request import RunRequest
 from sumo_cohesion.simulation.setup import resolve
 from sumo_cohesion.traffic.outputs import Output
@@ -42,6 +43,10 @@ Kept = Literal["ego", "trajectory", "plan", "horizon", "agreement", "timing", "r
 """Tables that can be kept per run; ``ego`` is the ego's part of the trajectory."""
 MOST_POINTS, MOST_RUNS = 20_000, 5_000_000
 """Largest experiment: a mistake in a grid should be a line, not a night of silence."""
+
+
+Settings = dict[str, list[tuple[Any, Any]]]
+"""Values of settings by dotted name, each as it is written and as it is used."""
 
 
 class RunLimits(BaseModel):
@@ -142,18 +147,27 @@ class Experiment(BaseModel):
         """Where its scenarios' files are looked up."""
         return self._folder.resolve()
 
-    def points(self) -> Iterator[Point]:
-        """Every scenario, planner and grid point, in the order of the file."""
+    def settings(self) -> Settings:
+        """Values of every setting in [set] and [grid], files read."""
         both = set(self.set) & set(self.grid)
         if both:
             raise UserError(f"{min(both)} is both in [set] and in [grid]; take one of them out")
+        axes = {name: [value] for name, value in self.set.items()} | self.grid
+        return {
+            name: [(value, read_files({name: value}, self._folder)[name]) for value in values]
+            for name, values in axes.items()
+        }
+
+    def points(self, settings: Settings) -> Iterator[Point]:
+        """Every scenario, planner and grid point, in the order of the file."""
         for scenario, planner in itertools.product(self.scenarios, self.planners):
-            for values in itertools.product(*self.grid.values()):
+            for values in itertools.product(*settings.values()):
+                named = dict(zip(settings, values, strict=True))
                 yield Point(
                     scenario=self._scenario_path(scenario),
                     planner=planner,
-                    grid=dict(zip(self.grid, values, strict=True)),
-                    fixed=self.set,
+                    grid={name: named[name][0] for name in self.grid},
+                    overrides={name: used for name, (_, used) in named.items()},
                 )
 
     def _scenario_path(self, scenario: str) -> str:
@@ -162,16 +176,19 @@ class Experiment(BaseModel):
 
 @dataclass(frozen=True)
 class Point:
-    """One scenario, planner and combination of the grid's values: all runs but for the seed."""
+    """One scenario, planner and combination of the grid's values: all runs but for the seed.
+
+    ``grid`` holds values as they are written, ``overrides`` all settings as they are used.
+    """
 
     scenario: str
     planner: str
     grid: Mapping[str, Value]
-    fixed: Mapping[str, Any]
+    overrides: Mapping[str, Any]
 
     def request(self, seed: int = 0) -> RunRequest:
         """Return one of its runs."""
-        return RunRequest(self.scenario, self.planner, seed, {**self.fixed, **self.grid})
+        return RunRequest(self.scenario, self.planner, seed, self.overrides)
 
 
 @dataclass(frozen=True)
@@ -183,10 +200,12 @@ class Work:
     plan : one row per wanted run: ``run`` (its key), scenario, planner, a column per grid name,
         seed. Rows whose settings come to the same share a run: nominal has no beta.
     points : the point that each distinct run belongs to.
+    files : what was read for settings that name a file: by setting, and by what is written.
     """
 
     plan: pd.DataFrame
     points: Mapping[str, Point]
+    files: Mapping[str, Mapping[str, Any]]
 
 
 def load_experiment(source: str | Path | Mapping[str, Any]) -> Experiment:
@@ -209,11 +228,20 @@ def load_experiment(source: str | Path | Mapping[str, Any]) -> Experiment:
     return experiment
 
 
-def stored_experiment(data: Mapping[str, Any], folder: Path) -> Experiment:
-    """Return the experiment that a batch's manifest holds, and where its files are looked up."""
-    experiment = validated(Experiment, dict(data), "experiment")
-    experiment._folder = folder
-    return experiment
+def stored_points(about: Mapping[str, Any]) -> tuple[list[Point], list[int]]:
+    """Return the points and the seeds of the experiment that a batch's manifest holds.
+
+    What was read from files then counts, not what they say now.
+    """
+    experiment = validated(Experiment, dict(about["experiment"]), "experiment")
+    experiment._folder = Path(about["folder"])
+    axes = {name: [value] for name, value in experiment.set.items()} | experiment.grid
+    read = about["files"]
+    settings = {
+        name: [(v, read[name][v] if name in read and v in read[name] else v) for v in values]
+        for name, values in axes.items()
+    }
+    return list(experiment.points(settings)), list(experiment.seeds)
 
 
 def spell_out(experiment: Experiment) -> Work:
@@ -236,7 +264,8 @@ def _spelt_out(experiment: Experiment) -> Work:
     blocks: list[dict[str, Any]] = []
     points: dict[str, Point] = {}
     sources: dict[str, str] = {}
-    for point in experiment.points():
+    settings = experiment.settings()
+    for point in experiment.points(settings):
         inputs = resolve(point.request())
         check_planner(point.planner)
         name = inputs.scenario.name
@@ -260,7 +289,15 @@ def _spelt_out(experiment: Experiment) -> Work:
         raise UserError("[grid] lists a value twice, written in two ways, such as 1 and 1.0")
     for text in ("run", "scenario", "planner"):
         plan[text] = plan[text].astype("string")
-    return Work(plan, points)
+    return Work(plan, points, _files_of(settings))
+
+
+def _files_of(settings: Settings) -> dict[str, dict[str, Any]]:
+    read = {
+        name: {str(written): used for written, used in values if used is not written}
+        for name, values in settings.items()
+    }
+    return {name: files for name, files in read.items() if files}
 
 
 def flatten(data: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

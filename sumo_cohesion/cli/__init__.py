@@ -11,7 +11,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import click
 
-from sumo_cohesion.cli import about, batches, results, running, scenarios
+from sumo_cohesion.cli import about, batches, learning, results, running, scenarios, tuning
 from sumo_cohesion.cli.options import Asked
 from sumo_cohesion.errors import SimulationError, UserError
 
@@ -27,6 +27,8 @@ for _command in (
     running.run,
     running.compare,
     batches.run_batch,
+    tuning.tune,
+    learning.learn,
     results.metrics,
     results.figure,
     scenarios.scenario,

@@ -68,7 +68,7 @@ def print_summary(summary: pd.DataFrame) -> None:
 
 @contextmanager
 def progress_bar(title: str, runs: int | None = None) -> Iterator[Any]:
-    """Say how far a number of runs are, on standard error: (done, total, failed) are shown.
+    """Say how far a number of runs are, on standard error: (done, total, failed, what) are shown.
 
     A bar with rate and ETA on a terminal; elsewhere a line now and then, for the log of a night.
     """
@@ -80,11 +80,11 @@ def progress_bar(title: str, runs: int | None = None) -> Iterator[Any]:
 def _lines(title: str) -> Iterator[Any]:
     told = time.monotonic()
 
-    def show(done: int, total: int, failed: int = 0) -> None:
+    def show(done: int, total: int, failed: int = 0, what: str = "") -> None:
         nonlocal told
         if time.monotonic() - told > _QUIET:
             told = time.monotonic()
-            click.echo(f"{_counted(title, failed)}: {done} of {total}", err=True)
+            click.echo(f"{_counted(title, failed, what)}: {done} of {total}", err=True)
 
     yield show
 
@@ -112,13 +112,15 @@ def _bar(title: str, runs: int | None) -> Iterator[Any]:
     with Progress(*columns, console=Console(stderr=True)) as bar:
         task = bar.add_task(title, total=runs)
 
-        def show(done: int, total: int, failed: int = 0) -> None:
-            bar.update(task, completed=done, total=total, description=_counted(title, failed))
+        def show(done: int, total: int, failed: int = 0, what: str = "") -> None:
+            description = _counted(title, failed, what)
+            bar.update(task, completed=done, total=total, description=description)
 
         yield show
 
 
-def _counted(title: str, failed: int) -> str:
+def _counted(title: str, failed: int, what: str) -> str:
+    title = f"{title}: {what}" if what else title
     return f"{title}, {failed} failed" if failed else title
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from sumo_cohesion.batches.experiment import stored_experiment
+from sumo_cohesion.batches.experiment import stored_points
 from sumo_cohesion.batches.results import run_folders
 from sumo_cohesion.batches.store import (
     as_cell,
@@ -24,7 +24,7 @@ from sumo_cohesion.demonstrations.plans import plans
 from sumo_cohesion.errors import UserError
 from sumo_cohesion.learning.example import Example
 from sumo_cohesion.learning.recording import COLUMNS, Recording
-from sumo_cohesion.learning.source import Kind
+from sumo_cohesion.learning.source import Kind, Source
 from sumo_cohesion.learning.tracks import Cutting, cut
 from sumo_cohesion.planning.settings import PlannerSettings
 from sumo_cohesion.road import Road
@@ -51,7 +51,7 @@ class Run:
     special: frozenset[str]
     table: Callable[[str], pd.DataFrame]
 
-    def source(self, kind: Kind) -> PlansOf | TracksOf:
+    def source(self, kind: Kind) -> Source:
         """Return the driving that is asked for."""
         return PlansOf(self) if kind == "plans" else TracksOf(self, kind)
 
@@ -163,12 +163,12 @@ def _parquet(path: Path) -> pd.DataFrame:
 
 def _of_batch(folder: Path) -> list[Run]:
     about, plan = manifest(folder), wanted(folder)
-    if "folder" not in about:
+    if not {"folder", "files"} <= set(about):
         raise UserError(f"{folder}: does not say where its scenarios are; run the batch again")
-    experiment = stored_experiment(about["experiment"], Path(about["folder"]))
+    points, seeds = stored_points(about)
     found = []
-    for point in experiment.points():
-        setup = prepare(point.request(int(experiment.seeds[0])))
+    for point in points:
+        setup = prepare(point.request(seeds[0]))
         rows = plan[(plan["scenario"] == setup.scenario.name) & (plan["planner"] == point.planner)]
         for key, value in point.grid.items():
             rows = rows[rows[key].astype(str) == str(as_cell(value))]

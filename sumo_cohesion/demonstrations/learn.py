@@ -10,7 +10,8 @@ from sumo_cohesion.demonstrations.folders import Run, runs_in
 from sumo_cohesion.errors import UserError
 from sumo_cohesion.learning.learn import Options, Progress, learn_from
 from sumo_cohesion.learning.learned import Learned
-from sumo_cohesion.learning.source import Kind, Source
+from sumo_cohesion.learning.recording import Recording
+from sumo_cohesion.learning.source import Kind, Tracks
 from sumo_cohesion.learning.tracks import Cutting
 from sumo_cohesion.planning.reward import RewardWeights
 from sumo_cohesion.planning.settings import PlannerSettings
@@ -18,6 +19,7 @@ from sumo_cohesion.simulation.overrides import settings_from
 from sumo_cohesion.user_input import closest
 
 KINDS = get_args(Kind)
+_DID = {"plans": "planned", "driven": "drove", "humans": ""}
 KEEP = {"plans": 0.85, "driven": 0.85, "humans": 0.95}
 """Share of the segments that the fit is made of, unless told otherwise."""
 SMOOTH = {"plans": (0.0, 0.0), "driven": (0.0, 0.0), "humans": (1.0, 2.0)}
@@ -31,6 +33,7 @@ def learn(
     *,
     source: Kind = "plans",
     network: str | Path | None = None,
+    demand: Sequence[str | Path] = (),
     steps: int | None = None,
     smooth: tuple[float, float] | None = None,
     desired: str = "limit",
@@ -54,6 +57,7 @@ def learn(
     source : whose driving of a run: a planner's "plans", what it has "driven", or the "humans"
         around it. Files hold humans.
     network : SUMO network that a file's vehicles drove in; CommonRoad brings its own.
+    demand : route and additional files that have the types of SUMO's vehicles: their sizes.
     steps : of 0.1 s per segment. Default: the plans' horizon; else 10.
     smooth : seconds along and across the road; faster oscillations are noise. Default: 1, 2 for
         humans, nothing for planners.
@@ -76,19 +80,16 @@ def learn(
     settings, _, of_scenario = settings_from(overrides or {})
     for name in of_scenario:
         raise UserError(f"{name} is a scenario's: learn takes planner.* settings only")
-    paths = [demos] if isinstance(demos, str | Path) else list(demos)
+    paths = [Path(p) for p in ([demos] if isinstance(demos, str | Path) else demos)]
     if not paths:
         raise UserError("nothing to learn from: give folders of runs, or files of driving")
-    sources: list[Source] = []
-    runs: list[Run] = []
-    for path in map(Path, paths):
-        if path.is_dir():
-            runs += runs_in(path)
-        else:
-            raise UserError(f"{path}: no such folder")
+    runs = [run for path in paths if path.is_dir() for run in runs_in(path)]
     if runs:
         settings = _common_settings(runs, overrides or {})
-        sources += [run.source(source) for run in runs]
+    if runs and source != "humans" and not all(path.is_dir() for path in paths):
+        raise UserError(f"files hold humans, not what a planner {_DID[source]}: --from humans")
+    files = _recordings([path for path in paths if not path.is_dir()], network, demand)
+    sources = [*[run.source(source) for run in runs], *map(Tracks, files)]
     settings = settings.model_copy(update={"reward": _reward(also)})
     length = steps or (settings.horizon if source == "plans" and runs else 10)
     how = Cutting(
@@ -99,19 +100,35 @@ def learn(
         by_vehicle=source == "humans" or not runs,
         bounded=source == "driven",
     )
-    exact = source == "plans" and len(runs) == len(sources)
+    exact = source == "plans" and not files
     shown = source if runs else "humans"
     options = Options(
         KEEP[shown] if keep is None else keep, dict(fix or {}), hold_out, draws, exact
     )
-    told = [str(path) for path in paths]
     about = {
-        "demonstrations": told,
-        "source": source,
+        "demonstrations": [str(path) for path in paths],
+        "source": shown,
         "smooth": list(how.smooth),
         "desired": desired,
+        "notes": [note for recording in files for note in recording.notes],
     }
     return learn_from(sources, how, settings, options, about, progress)
+
+
+def _recordings(
+    paths: Sequence[Path], network: str | Path | None, demand: Sequence[str | Path]
+) -> list[Recording]:
+    """Read files of driving."""
+    from sumo_cohesion.demonstrations.reading import read
+    from sumo_cohesion.traffic.network import Network
+
+    on = Network(Path(network)) if network is not None and paths else None
+    found = []
+    for path in paths:
+        if not path.exists():
+            raise UserError(f"{path}: there is no such file or folder to learn from")
+        found.append(read(path, on, [Path(file) for file in demand]))
+    return found
 
 
 def _check(

@@ -278,19 +278,26 @@ def _weight_table(
     nothing = np.full(len(found.names), np.nan)
     low, high = interval or (nothing, nothing)
     known = [name not in found.kept_default for name in found.names]
+    free = [name not in found.kept_default and name != found.anchor for name in found.names]
     return pd.DataFrame(
         {
             "term": found.names,
             "default": defaults,
             "learned": found.weights,
-            "low": np.where(known, low, np.nan),
-            "high": np.where(known, high, np.nan),
+            "low": np.where(free, _rounded(low, np.floor), np.nan),
+            "high": np.where(free, _rounded(high, np.ceil), np.nan),
             "error": found.error,
             "identified": known,
             "kept_default": [found.kept_default.get(name, "") for name in found.names],
             "share": found.share,
         }
     ).astype({"term": "string", "kept_default": "string"})
+
+
+def _rounded(values: FloatArray, towards: Callable[[FloatArray], FloatArray]) -> FloatArray:
+    """Round outwards to three digits: what a solver's tolerance leaves open is unknown, too."""
+    digit = 10.0 ** (np.floor(np.log10(np.maximum(np.abs(values), 1e-300))) - 2.0)
+    return towards(values / digit) * digit
 
 
 def _segment_table(segments: Segments, found: Fit) -> pd.DataFrame:

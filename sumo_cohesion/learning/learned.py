@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from html import escape
+from math import isnan
 from pathlib import Path
 from typing import Any
 
@@ -62,17 +63,31 @@ class Learned:
             If a file that is none of ours is there, or it cannot be written.
         """
         path = Path(path)
+        require_writable(path)
+        new = path.with_name(f".{path.name}.new")
         try:
-            if path.exists() and not path.read_text(encoding="utf-8").startswith(_FIRST_LINE):
-                raise UserError(f"{path}: was not written by learn and stays; name another --out")
-            path.parent.mkdir(parents=True, exist_ok=True)
-            new = path.with_name(f".{path.name}.new")
             new.write_text(self.to_toml(), encoding="utf-8")
             new.replace(path)
-        except (OSError, UnicodeDecodeError) as error:
-            said = getattr(error, "strerror", None) or error
-            raise UserError(f"{path}: cannot be written ({said}); choose another --out") from None
+        except OSError as error:
+            raise _cannot_write(path, error) from None
         return path
+
+    def summary(self) -> str:
+        """Weights, and models on held-out runs, as text."""
+        lines = [f"{'term':20}{'default':>12}{'learned':>12}  90 % of a bootstrap over runs"]
+        for row in self.weights.to_dict(orient="records"):
+            said = row["kept_default"] or "what the others are relative to"
+            if row["low"] < row["high"]:
+                said = f"{row['low']:.3g} to {row['high']:.3g}"
+            lines.append(f"{row['term']:20}{row['default']:12.4g}{row['learned']:12.4g}  {said}")
+        lines.append(f"temperature {self.temperature:.3g}")
+        if len(self.fit):
+            lines += ["", "on runs held out: log-likelihood (nats/s), m off after 1, 2, 3 s"]
+        for row in self.fit.to_dict(orient="records"):
+            numbers = [row["log_likelihood"], *[row[f"off_{h}s"] for h in (1, 2, 3)]]
+            cells = ["-" if isnan(n) else f"{n:.3g}" for n in numbers]
+            lines.append(f"{row['model']:30}" + "".join(f"{cell:>9}" for cell in cells))
+        return "\n".join(lines)
 
     def to_toml(self) -> str:
         """Return the weights and how they were learned, as TOML."""
@@ -93,6 +108,23 @@ class Learned:
 
 
 _FIRST_LINE = "# Reward weights learned from driving by sumo-cohesion learn."
+
+
+def require_writable(path: Path) -> None:
+    """Raise UserError unless weights can be written there: over none or earlier ones of ours."""
+    try:
+        if path.is_dir():
+            raise UserError(f"{path}: is a folder; name a file with --out, e.g. theta.toml")
+        if path.exists() and not path.read_bytes().startswith(_FIRST_LINE.encode()):
+            raise UserError(f"{path}: was not written by learn and stays; name another --out")
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise _cannot_write(path, error) from None
+
+
+def _cannot_write(path: Path, error: OSError) -> UserError:
+    said = error.strerror or error
+    return UserError(f"{path}: cannot be written ({said}); choose another --out")
 
 
 def _toml(value: Any) -> str:

@@ -14,7 +14,7 @@ from sumo_cohesion.planning import dynamics
 from sumo_cohesion.planning.reward import RewardWeights
 from sumo_cohesion.planning.settings import PlannerSettings
 from sumo_cohesion.planning.solvers.mpc import Mpc
-from sumo_cohesion.state import STEP, BoolArray, Control, FloatArray
+from sumo_cohesion.state import STEP, BoolArray, Control, FloatArray, RoadState
 
 HORIZONS = (1.0, 2.0, 3.0)
 """Seconds after which a prediction is compared with what was driven."""
@@ -124,6 +124,6 @@ def _driven_on(example: Example, control: Control | None, settings: PlannerSetti
             held = held._replace(
                 curvature=bend * np.cos(state[2]) / dynamics.stretch(bend, state[1])
             )
-        state = dynamics.step(state, held, STEP, settings.friction, bend)
+        state = RoadState(*dynamics.step(state, held, STEP, settings.friction, bend))
         places[t] = state[:2]
     return places

@@ -17,7 +17,9 @@ Kind = Literal["plans", "driven", "humans"]
 class Source(Protocol):
     """One run or one file."""
 
-    name: str
+    @property
+    def name(self) -> str:
+        """Of the run or file, for messages."""
 
     def examples(self, how: Cutting) -> Sequence[Example]:
         """Cut its driving into examples."""

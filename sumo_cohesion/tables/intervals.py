@@ -55,6 +55,29 @@ def mean_interval(values: Sequence[float]) -> tuple[float, float, float]:
     return mean, float(interval.low), float(interval.high)
 
 
+def median_interval(values: Sequence[float]) -> tuple[float, float, float]:
+    """Median and its percentile bootstrap interval; fixed random numbers.
+
+    One value, or several equal ones, give an interval of width zero.
+
+    >>> median_interval([2.0, 2.0])
+    (2.0, 2.0, 2.0)
+    """
+    data = np.asarray(values, dtype=float)
+    median = float(np.median(data))
+    if data.size < 2 or np.ptp(data) == 0.0:
+        return median, median, median
+    interval = stats.bootstrap(
+        (data,),
+        np.median,
+        confidence_level=_LEVEL,
+        method="percentile",  # BCa rests on leaving one out, which says little of a median
+        n_resamples=2000,
+        rng=0,
+    ).confidence_interval
+    return median, float(interval.low), float(interval.high)
+
+
 def summarize(metrics: pd.DataFrame) -> pd.DataFrame:
     """Summarize metrics rows by planner: value, low, high and n for each rate and mean.
 

@@ -178,7 +178,9 @@ def test_listing_scenarios_is_light() -> None:
     assert not heavy_after("scenarios")
 
 
-@pytest.mark.parametrize("arguments", [["--help"], ["run", "--help"], ["batch", "--help"]])
+@pytest.mark.parametrize(
+    "arguments", [["--help"], ["run", "--help"], ["batch", "--help"], ["tune", "-h"]]
+)
 def test_help_is_light(arguments: list[str]) -> None:
     assert not heavy_after(*arguments)
 

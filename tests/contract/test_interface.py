@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -171,3 +172,23 @@ def test_a_sumo_that_is_too_old_is_told(monkeypatch: pytest.MonkeyPatch) -> None
     monkeypatch.setitem(sys.modules, "libsumo", Asked("SUMO 1.22.0"))
     with pytest.raises(sc.UserError, match=r"libsumo 1\.22 is too old; pip install --upgrade"):
         load_libsumo()
+
+
+@pytest.mark.slow
+def test_what_a_settings_file_says_is_kept_with_every_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("theta.toml").write_text("[planner.reward]\nspeed = 0.012\n[cohesion]\nbeta = 0.36\n")
+    files = {"planner.reward": "@theta.toml", "cohesion.beta": "@theta.toml"}
+    values = {"planner.reward": {"speed": 0.012}, "cohesion.beta": 0.36}
+    sc.run("stalled", overrides=BRIEF | files, out="one")
+    sc.compare("stalled", "cohesive", [0], overrides=BRIEF | files, out="several", workers=1)
+    same = sc.run("stalled", overrides=BRIEF | values)
+    for folder in ("one", "several/cohesive/seed_0000"):
+        rollout = sc.Rollout.read(folder)
+        assert rollout.info["settings"]["reward"]["speed"] == 0.012
+        assert rollout.info["cohesion"]["beta"] == 0.36
+        pd.testing.assert_frame_equal(rollout.plan, same.plan)
+    about = json.loads(Path("several/comparison.json").read_text())
+    assert about["overrides"] == BRIEF | values

@@ -184,6 +184,12 @@ def test_broken_network_and_route_files(
         (["run", "stalled", "--set", "planner=nominal"], ["planner.horizon", "--planner"]),
         (["run", "stalled", "--set", "egg.lane=1"], ["did you mean 'ego.lane'"]),
         (["run", "stalled", "--set", "weather=1"], ["planner.*", "cohesion.*", "duration"]),
+        (["run", "stalled", "--set", "planner.reward=@theta.toml"], ["theta.toml", "No such file"]),
+        (["compare", "stalled", "--set", "cohesion.beta=@."], [".: ", "Is a directory"]),
+        (
+            ["scenario", "export", "stalled", "--out", "x", "--set", "planner.reward=@"],
+            ["name a TOML file"],
+        ),
         (["run", "stalled", "--sed", "1"], ["--sed"]),
         (["compare", "stalled", "--seeds", "5:5"], ["5:5", "empty"]),
         (["compare", "stalled", "--seeds", "a:b"], ["0:20"]),

@@ -334,6 +334,61 @@ def test_a_network_that_changes_while_it_runs_stops_no_run_from_being_true(tmp_p
     assert (batch(experiment, tmp_path / "out", workers=1)["status"] == "done").all()
 
 
+def weights(path: Path, speed: float) -> Path:
+    """Write a file of reward weights, as learn does."""
+    path.write_text(f"[planner.reward]\nspeed = {speed}\n[learned]\nn = 50\n")
+    return path
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("dask", [None, "local"])
+def test_a_grid_over_files_is_read_once_beside_the_experiment(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, dask: str | None
+) -> None:
+    if dask is not None:
+        pytest.importorskip("distributed")
+    files = [weights(tmp_path / f"{name}.toml", speed) for name, speed in (("a", 0.01), ("b", 10))]
+    experiment = {
+        "scenarios": ["speeding"],
+        "planners": ["nominal"],
+        "seeds": "0:2",
+        "set": {"duration": 3.0, "ego.speed": 20.0},
+        "grid": {"planner.reward": ["@a.toml", "@b.toml"]},
+    }
+    file, out = toml(experiment, tmp_path / "mine.toml"), tmp_path / "out"
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+
+    def gone(_: Progress) -> None:
+        for path in files:  # what they said is known: no run reads them again
+            path.unlink(missing_ok=True)
+
+    rows = batch(file, out, workers=1, dask=dask, progress=gone)
+    assert rows["planner.reward"].tolist() == ["@a.toml"] * 2 + ["@b.toml"] * 2
+    assert (rows["status"] == "done").all()
+    settings = {"duration": 3.0, "ego.speed": 20.0}
+    for row, speed in ((0, 0.01), (2, 10.0)):
+        used = settings | {"planner.reward": {"speed": speed}}
+        (alone,) = run("speeding", "nominal", 0, overrides=used).metrics["mean_speed"]
+        assert rows["mean_speed"][row] == alone
+    assert rows["mean_speed"].nunique() == 4
+    manifest = json.loads((out / "manifest.json").read_text())
+    assert manifest["files"]["planner.reward"]["@b.toml"] == {"speed": 10}
+    with pytest.raises(UserError, match=r"mine\.toml: .*a\.toml: cannot be read"):
+        batch(file, out, workers=1)
+    # The same content: nothing is run again. Another: only that file's runs are.
+    for path, speed in zip(files, (0.01, 10.0), strict=True):
+        weights(path, speed)
+    total: list[int] = []
+    batch(file, out, workers=1, progress=counting(total))
+    assert total == []
+    weights(files[0], 0.02)
+    again = batch(file, out, workers=1, progress=counting(total))
+    assert total == [2, 2]
+    assert set(again["run"][2:]) == set(rows["run"][2:])
+    assert not set(again["run"][:2]) & set(rows["run"])
+
+
 @pytest.mark.slow
 def test_a_planners_own_code_decides_which_run_it_is(tmp_path: Path) -> None:
     """A package, and a module with a helper beside it: a change in either makes new runs."""
@@ -489,6 +544,7 @@ def test_a_reason_that_is_no_text_does_not_spoil_the_batch(tmp_path: Path) -> No
         ({"planners": [FAULTY + "Good(x=1)"]}, "cannot be called with these arguments"),
         ({"grid": {"chesion.beta": [1.0]}}, "did you mean 'cohesion.beta'"),
         ({"grid": {"beta": [1.0]}}, "did you mean 'cohesion.beta'"),
+        ({"grid": {"planner.reward": ["@gone.toml"]}}, r"gone\.toml: cannot be read"),
         ({"planners": [FAULTY + "CannotBeMade"]}, "cannot be called with these arguments"),
         ({"keep": ["everything"]}, "keep"),
         ({"colour": 1}, "unknown key 'colour'"),

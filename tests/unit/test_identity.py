@@ -75,6 +75,20 @@ def test_settings_count_where_they_are_used(digest: Callable[..., str]) -> None:
     assert digest(planner__horizon=10) == digest()  # the default, spelt out
 
 
+def test_what_a_settings_file_says_counts_and_nothing_else_of_it(
+    digest: Callable[..., str], tmp_path: Path
+) -> None:
+    theta, copy = tmp_path / "theta.toml", tmp_path / "copy.toml"
+    theta.write_text("[planner.reward]\nspeed = 0.01\n")
+    copy.write_text("# the same\n[learned]\nn = 5\n[planner.reward]\nspeed = 0.010\n")
+    before = digest(planner__reward=f"@{theta}")
+    assert digest(planner__reward=f"@{copy}") == before
+    assert digest(planner__reward={"speed": 0.01}) == digest(planner__reward__speed=0.01) == before
+    assert digest() != before
+    theta.write_text("[planner.reward]\nspeed = 0.02\n")
+    assert digest(planner__reward=f"@{theta}") != before
+
+
 def test_a_key_is_of_a_point_and_a_seed() -> None:
     keys = {run_key(point, seed) for point in ("a", "b") for seed in range(50)}
     assert len(keys) == 100
