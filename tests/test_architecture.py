@@ -43,7 +43,7 @@ OUTSIDE = {
     "libsumo": {"traffic"},
     "sumolib": {"traffic"},
     "traci": {"traffic"},
-    "casadi": {"planning"},
+    "casadi": {"planning", "learning"},
 }
 NOBODY_NEEDS = {"cli", "report", "__main__"}
 """Rooms that only the command line opens."""
