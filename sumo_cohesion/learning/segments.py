@@ -20,6 +20,9 @@ from sumo_cohesion.state import STEP, BoolArray, Control, FloatArray
 
 SLOWEST = 2.0
 """Speed (m/s) below which standing still bounds the control, and curvature says little."""
+RAILS = 0.005
+"""Metres across the road within a segment up to which a human is on rails: SUMO's drivers follow the
+middle of their lane exactly, and steer only to change it."""
 _NOT_DRIVEN = Control(0.0, 0.0)
 _HAIR = 1e-6
 """Scaled control within which a bound counts as reached."""
@@ -99,7 +102,13 @@ def make_segments(examples: Sequence[Example], settings: PlannerSettings) -> Seg
     lost = (reason == "") & ~np.isfinite(driven).all(axis=(1, 2))
     reason[lost | (states[:, :, 3] < SLOWEST).any(axis=1) & (reason == "")] = "slower than 2 m/s"
     driven[~np.isfinite(driven)] = 0.0
-    outside = ((driven < low - _HAIR) | (driven > high + _HAIR)).any(axis=(1, 2))
+    beyond = (driven < low - _HAIR) | (driven > high + _HAIR)
+    before = np.concatenate((start[:, None, 4:], driven[:, :-1]), axis=1)
+    outside = (beyond | (np.abs(driven - before) > change + _HAIR)).any(axis=(1, 2))
+    # Who does not leave the lane by a hair has chosen nothing across the road.
+    rails = ~np.array([e.bounded for e in examples], dtype=bool)
+    rails &= np.ptp(states[:, :, 1], axis=1) < RAILS
+    low[rails, :, 0] = high[rails, :, 0] = driven[rails, :, 0]
     return Segments(
         run=np.array([e.run for e in examples], dtype=object),
         vehicle=np.array([e.vehicle for e in examples], dtype=object),
@@ -160,8 +169,8 @@ def free_directions(segments: Segments) -> tuple[FloatArray, BoolArray]:
     basis, free = np.tile(np.eye(size), (n, 1, 1)), np.ones((n, size), dtype=bool)
     u = segments.controls
     before = np.concatenate((segments.start[:, None, 4:], u[:, :-1]), axis=1)
-    at_bound = (u < segments.low + _HAIR) | (u > segments.high - _HAIR)
-    at_change = np.abs(u - before) > segments.change - _HAIR
+    at_bound = (np.abs(u - segments.low) < _HAIR) | (np.abs(u - segments.high) < _HAIR)
+    at_change = np.abs(np.abs(u - before) - segments.change) < _HAIR
     for i in np.flatnonzero((at_bound | at_change).any(axis=(1, 2))):
         normals = np.eye(size)[at_bound[i].ravel()]
         ties = np.flatnonzero(at_change[i].ravel())
