@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -56,18 +57,24 @@ def likelihoods(
         ("control before, white noise", segments.controls - first),
         ("random walk of controls", steps),
     ):
-        found[name] = _noise_likelihood(noise[train], noise[~train], keep)
+        chosen = np.where(segments.high > segments.low, noise, np.nan)
+        found[name] = _noise_likelihood(chosen[train], chosen[~train], keep)
     return {name: value / seconds for name, value in found.items()}
 
 
 def _noise_likelihood(seen: FloatArray, unseen: FloatArray, keep: float) -> float:
-    """Median log-likelihood of (N, T, 2) normal noise, of the deviations fitted to other noise."""
-    usual = np.maximum(np.median(np.abs(seen), axis=(0, 1)), 1e-12)
-    order = np.argsort(((seen / usual) ** 2).sum(axis=(1, 2)))
-    kept = seen[order[: max(round(keep * len(order)), 1)]]
-    deviation = np.maximum(np.sqrt((kept**2).mean(axis=(0, 1))), 1e-12)
+    """Median log-likelihood of (N, T, 2) normal noise, of the deviations fitted to other noise.
+
+    Not a number where there was no choice (who is on rails): it does not count.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # a control that nobody chose: no mean
+        usual = np.nanmedian(np.abs(seen), axis=(0, 1))
+        order = np.argsort(np.nansum((seen / np.maximum(usual, 1e-12)) ** 2, axis=(1, 2)))
+        kept = seen[order[: max(round(keep * len(order)), 1)]]
+        deviation = np.maximum(np.sqrt(np.nanmean(kept**2, axis=(0, 1))), 1e-12)
     each = -0.5 * (unseen / deviation) ** 2 - np.log(deviation) - 0.5 * np.log(2.0 * np.pi)
-    return float(np.median(each.sum(axis=(1, 2))))
+    return float(np.median(np.nansum(each, axis=(1, 2))))
 
 
 def spread_out(examples: Sequence[Example], most: int = WINDOWS) -> list[Example]:

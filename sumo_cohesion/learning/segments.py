@@ -21,8 +21,8 @@ from sumo_cohesion.state import STEP, BoolArray, Control, FloatArray
 SLOWEST = 2.0
 """Speed (m/s) below which standing still bounds the control, and curvature says little."""
 RAILS = 0.005
-"""Metres across the road within a segment up to which a human is on rails: SUMO's drivers follow the
-middle of their lane exactly, and steer only to change it."""
+"""Metres across the road within a segment up to which a human is on rails: SUMO's drivers follow
+their lane exactly, and steer only to change it."""
 _NOT_DRIVEN = Control(0.0, 0.0)
 _HAIR = 1e-6
 """Scaled control within which a bound counts as reached."""
