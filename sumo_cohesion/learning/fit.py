@@ -1,7 +1,7 @@
 """Find theta: maximum likelihood, trimmed, with what cannot be told from the data kept as it was.
 
-Weights w are relative to one that is kept, the anchor; the common scale of all is apart. A scale is
-the inverse of a temperature: the same driving, more or less exactly optimal.
+Only ratios of weights matter to a planner, and one of them, the anchor, says what one is. The
+common scale of all is the inverse of a temperature: the same driving, more or less exactly optimal.
 """
 
 from __future__ import annotations
@@ -20,7 +20,9 @@ ROUNDS = 6
 UNCERTAIN = 1.0
 """Standard error of a weight's logarithm above which the data do not tell it."""
 _FURTHEST = 18.0
-"""How far (natural logarithm) the fit may go from where it starts: 8 powers of ten."""
+"""How far (natural logarithm) a weight may fall from where it starts: 8 powers of ten."""
+ASKED, UNKNOWN = "as asked for", "the demonstrations do not tell it"
+"""Why a weight was not learned."""
 
 
 @dataclass(frozen=True)
@@ -30,30 +32,54 @@ class Fit:
     Attributes
     ----------
     names : (K,) of the reward terms, in the order of the data.
-    weights : (K,) with the anchor at its default.
-    scale : of all weights; the temperature is its inverse.
-    anchor : the weight that says what one is.
-    error : (K,) standard error of the weights' logarithms (Fisher information); inf where unknown.
+    theta : (K,) of the greatest likelihood.
+    error : (K,) standard errors of theta's logarithms (Fisher information); inf where unknown.
     kept_default : why a weight was not learned, by name.
+    anchor : the weight that says what one is: it is its default, all others are relative to it.
+    defaults : (K,) weights where nothing is learned.
     kept : (N,) segments that the fit is made of; each : (N,) log-likelihood; misfit : (N,) q / f.
     share : (K,) of the curvature that a term has, in the mean.
     """
 
     names: tuple[str, ...]
-    weights: FloatArray
-    scale: float
-    anchor: str
+    theta: FloatArray
     error: FloatArray
     kept_default: Mapping[str, str]
+    anchor: str
+    defaults: FloatArray
     kept: BoolArray
     each: FloatArray
     misfit: FloatArray
     share: FloatArray
 
     @property
-    def theta(self) -> FloatArray:
-        """(K,) the weights with their scale."""
-        return self.scale * self.weights
+    def scale(self) -> float:
+        """Of all weights: the inverse of the temperature."""
+        at = self.names.index(self.anchor)
+        return float(self.theta[at] / self.defaults[at])
+
+    @property
+    def weights(self) -> FloatArray:
+        """(K,) what was learned, relative to the anchor, and the defaults of what was not."""
+        known = [name not in self.kept_default for name in self.names]
+        return np.where(known, self.theta / self.scale, self.defaults)
+
+    def without(self, why: Mapping[str, str]) -> Fit:
+        """Return the same with weights that are not believed, by name with the reason.
+
+        If the anchor is one of them, the one that is known best takes its place.
+        """
+        doubted = {**self.kept_default, **why}
+        anchor = self.anchor
+        if anchor in why:
+            known = [
+                i
+                for i, name in enumerate(self.names)
+                if name not in doubted and self.defaults[i] > 0.0
+            ]
+            if known:
+                anchor = self.names[min(known, key=lambda i: self.error[i])]
+        return replace(self, kept_default=doubted, anchor=anchor)
 
 
 def fit(
@@ -68,182 +94,117 @@ def fit(
     Parameters
     ----------
     defaults : (K,) weights that are kept where nothing is learned; 0 is off.
-    fixed : weights that are not learned, by name.
+    fixed : weights that are not learned, by name, relative to the lane's (the first that is on).
     keep : share of the segments that the fit is made of: those it fits worst are trimmed, because
         driving that is no optimum of anything would decide everything.
 
-    A weight of which the data say nothing would go to zero, which is not "learned zero": it keeps
-    its default.
+    A weight of which the data say nothing goes to zero, which is not "learned zero": its default is
+    what is reported.
     """
-    why = dict.fromkeys(fixed, "as asked for")
-    held = {name: value for name, value in zip(names, defaults, strict=True) if name in fixed}
-    held |= fixed
-    chosen = _start(data, defaults)
-    while True:
-        free = [name for name in names if name not in held]
-        anchor = _anchor(free, names, defaults, why)
-        found = _trimmed(data, names, held, anchor, chosen, defaults, keep)
-        unknown = {
-            name: found.error[names.index(name)]
-            for name in free
-            if name != anchor and not found.error[names.index(name)] <= UNCERTAIN
-        }
-        if not unknown:
-            return replace(found, kept_default=why)
-        name = max(unknown, key=lambda n: unknown[n])
-        held[name] = float(defaults[names.index(name)])
-        why[name] = "the demonstrations do not tell it"
-        chosen = found.theta
+    n, counted = len(data.gradient), np.ones(len(data.gradient))
+    free = [i for i, name in enumerate(names) if name not in fixed]
+    reference = next((i for i in free if defaults[i] > 0.0), 0)
+    held = {names.index(name): value for name, value in fixed.items()}
+    theta = _start(data, defaults)
+    kept = np.ones(n, dtype=bool)
+    for _ in range(ROUNDS):
+        theta, error = maximise(data, kept.astype(float), held, reference, defaults, theta)
+        found = score(data, theta, counted)
+        misfit = found.misfit / np.maximum(data.free, 1.0)
+        again = np.zeros(n, dtype=bool)
+        again[np.argsort(misfit, kind="stable")[: max(round(keep * n), 1)]] = True
+        if (again == kept).all():
+            break
+        kept = again
+    strength = np.einsum("k,nkii->nk", theta, data.curvature[kept])
+    share = (strength / np.maximum(strength.sum(axis=1, keepdims=True), 1e-300)).mean(axis=0)
+    result = Fit(
+        names,
+        theta,
+        error,
+        dict.fromkeys(fixed, ASKED),
+        names[reference],
+        defaults,
+        kept,
+        found.each,
+        misfit,
+        share,
+    )
+    return result.without({names[i]: UNKNOWN for i in free if not error[i] <= UNCERTAIN})
 
 
 def _start(data: Quadratics, defaults: FloatArray) -> FloatArray:
     """Weights to begin with: the defaults; what is off by default begins as strong as the rest."""
     strength = np.einsum("nkii->k", data.curvature)
-    known = defaults > 0.0
-    usual = np.median((defaults * strength)[known & (strength > 0.0)]) if known.any() else 1.0
-    with np.errstate(divide="ignore"):
-        equal = np.where(strength > 0.0, usual / strength, 1.0)
-    return np.where(known, defaults, equal)
-
-
-def _anchor(
-    free: list[str], names: tuple[str, ...], defaults: FloatArray, why: Mapping[str, str]
-) -> str:
-    """Return the weight that all others are relative to: the first that can be learned.
-
-    In the order of planning.reward, where the lane comes first.
-    """
-    on = [name for name in names if defaults[names.index(name)] > 0.0]
-    return next((name for name in on if name in free), next(iter(why), names[0]))
-
-
-def _trimmed(
-    data: Quadratics,
-    names: tuple[str, ...],
-    held: Mapping[str, float],
-    anchor: str,
-    start: FloatArray,
-    defaults: FloatArray,
-    keep: float,
-) -> Fit:
-    """Fit, leave out the segments that fit worst, and fit again until these stay the same."""
-    n = len(data.gradient)
-    kept = np.ones(n, dtype=bool)
-    theta = start
-    for _ in range(ROUNDS):
-        theta, error = maximise(data, kept.astype(float), names, held, anchor, theta, defaults)
-        found = score(data, theta, np.ones(n))
-        misfit = found.misfit / np.maximum(data.free, 1.0)
-        order = np.argsort(misfit, kind="stable")
-        again = np.zeros(n, dtype=bool)
-        again[order[: max(round(keep * n), 1)]] = True
-        if (again == kept).all():
-            break
-        kept = again
-    unit = defaults[names.index(anchor)] if defaults[names.index(anchor)] > 0.0 else 1.0
-    scale = float(theta[names.index(anchor)] / unit)
-    strength = np.einsum("k,nkii->nk", theta, data.curvature[kept])
-    share = (strength / np.maximum(strength.sum(axis=1, keepdims=True), 1e-300)).mean(axis=0)
-    return Fit(names, theta / scale, scale, anchor, error, {}, kept, found.each, misfit, share)
+    known = (defaults > 0.0) & (strength > 0.0)
+    usual = float(np.median((defaults * strength)[known])) if known.any() else 1.0
+    equal = usual / np.maximum(strength, 1e-300)
+    return np.where(defaults > 0.0, defaults, np.where(strength > 0.0, equal, 1.0))
 
 
 def maximise(
     data: Quadratics,
     counted: FloatArray,
-    names: tuple[str, ...],
-    held: Mapping[str, float],
-    anchor: str,
-    start: FloatArray,
+    held: Mapping[int, float],
+    reference: int,
     defaults: FloatArray,
+    start: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
-    """Find theta of the greatest likelihood, and the standard errors of the weights' logarithms.
+    """Find theta of the greatest likelihood, and the standard errors of its logarithms.
 
-    Unknown are the logarithms of the scale and of every weight relative to the anchor; weights that
-    are held have no unknown, but they, too, are multiplied by the scale.
+    Unknown are the logarithms of all weights that are not held; those that are held are so relative
+    to the reference.
     """
     used = counted > 0.0
     some, counts = data.where(used), counted[used]
-    free = [i for i, name in enumerate(names) if name not in held and name != anchor]
-    at = names.index(anchor)
-    unit = defaults[at] if defaults[at] > 0.0 else 1.0
-    weights = np.array([held.get(name, 0.0) for name in names])
-    weights[at] = held.get(anchor, unit)
-    scale = max(start[at] / weights[at], 1e-300) if weights[at] > 0.0 else 1.0
-
-    def theta_of(x: FloatArray) -> FloatArray:
-        w = weights.copy()
-        w[free] = np.exp(x[1:])
-        return np.asarray(np.exp(x[0]) * w)
-
-    def chain(theta: FloatArray) -> FloatArray:
-        """Slope of theta in x: (K, 1 + number of free weights)."""
-        columns = np.zeros((len(names), 1 + len(free)))
-        columns[:, 0] = theta
-        columns[free, np.arange(1, 1 + len(free))] = theta[free]
-        return columns
-
     total = float(counts @ some.free)
+    free = [i for i in range(len(defaults)) if i not in held]
+    # Theta is linear in the exponentials of the unknowns: one column for each.
+    columns = np.zeros((len(defaults), len(free)))
+    columns[free, np.arange(len(free))] = 1.0
+    if reference in free:
+        for i, value in held.items():
+            columns[i, free.index(reference)] = value / defaults[reference]
 
     def loss(x: FloatArray) -> tuple[float, FloatArray]:
-        theta = theta_of(x)
-        found = score(some, theta, counts)
-        value = -float(counts @ found.each) / total
-        return value, np.asarray(-(found.gradient @ chain(theta)) / total)
+        chain = columns * np.exp(x)
+        found = score(some, chain.sum(axis=1), counts)
+        return -float(counts @ found.each) / total, np.asarray(-(found.gradient @ chain) / total)
 
     def bend(x: FloatArray) -> FloatArray:
-        theta = theta_of(x)
-        found, columns = score(some, theta, counts, with_hessian=True), chain(theta)
+        chain = columns * np.exp(x)
+        found = score(some, chain.sum(axis=1), counts, with_hessian=True)
         assert found.hessian is not None
-        curvature = -columns.T @ found.hessian @ columns
-        # d² theta / dx²: a logarithm's own, and those of scale and weight together.
-        slope = found.gradient * theta
-        curvature[0, 0] -= slope.sum()
-        for column, k in enumerate(free, start=1):
-            for entry in ((0, column), (column, 0), (column, column)):
-                curvature[entry] -= slope[k]
-        return np.asarray(curvature / total)
+        curvature = chain.T @ found.hessian @ chain + np.diag(found.gradient @ chain)
+        return np.asarray(-curvature / total)
 
-    # The best scale for given weights has a closed form: q and log|A| are simple in it.
-    relative = np.maximum(start, 1e-300) / scale
-    x0 = np.concatenate(([np.log(scale)], np.log(relative[free])))
-    misfit = counts @ score(some, theta_of(x0), counts).misfit
-    x0[0] += np.log(total / misfit) if misfit > 0.0 else 0.0
-    result = minimize(
-        loss,
-        x0,
-        jac=True,
-        hess=bend,
-        method="trust-exact",
-        options={"maxiter": 200, "gtol": 1e-7},
-    )
-    theta = theta_of(result.x)
-    curvature = total * bend(result.x)
-    error = np.full(len(names), np.inf)
-    error[free] = _errors(curvature)[1:]
-    error[at] = 0.0
-    for name in held:
-        error[names.index(name)] = 0.0
-    stuck = np.abs(result.x - x0) > _FURTHEST
-    error[np.array(free, dtype=int)[stuck[1:]]] = np.inf
-    return theta, error
+    x0 = np.log(np.maximum(start[free], 1e-300))
+    # The best common scale has a closed form: q and log|A| are simple in it.
+    misfit = float(counts @ score(some, (columns * np.exp(x0)).sum(axis=1), counts).misfit)
+    x0 += np.log(total / misfit) if misfit > 0.0 else 0.0
+    x = minimize(
+        loss, x0, jac=True, hess=bend, method="trust-exact", options={"maxiter": 200, "gtol": 1e-7}
+    ).x
+    error = np.zeros(len(defaults))
+    error[free] = np.where(x - x0 < -_FURTHEST, np.inf, _errors(total * bend(x)))
+    return (columns * np.exp(x)).sum(axis=1), error
 
 
 def _errors(curvature: FloatArray) -> FloatArray:
     """Square roots of the diagonal of a curvature's inverse; inf where it is not positive."""
     values, vectors = np.linalg.eigh(0.5 * (curvature + curvature.T))
-    with np.errstate(divide="ignore"):
-        inverse = np.where(values > 0.0, 1.0 / np.maximum(values, 1e-300), np.inf)
     share = vectors**2
-    variance = np.where(share > 1e-12, share * inverse, 0.0).sum(axis=1)
-    return np.asarray(np.sqrt(variance))
+    known = values > 0.0
+    variance = (share[:, known] / values[known]).sum(axis=1)
+    lost = (share[:, ~known] > 1e-9).any(axis=1)
+    return np.where(lost, np.inf, np.sqrt(variance))
 
 
 def bootstrap(
     data: Quadratics,
     groups: FloatArray,
     found: Fit,
-    held: Mapping[str, float],
-    defaults: FloatArray,
+    fixed: Mapping[str, float],
     draws: int,
     progress: Callable[[int, int], None] | None = None,
 ) -> FloatArray:
@@ -253,13 +214,19 @@ def bootstrap(
     """
     rng = np.random.default_rng(0)
     labels, member = np.unique(groups.astype(str), return_inverse=True)
-    at = found.names.index(found.anchor)
-    samples = np.zeros((draws, len(found.names)))
+    names, at = found.names, found.names.index(found.anchor)
+    free = [i for i, name in enumerate(names) if name not in fixed]
+    reference = next((i for i in free if found.defaults[i] > 0.0), 0)
+    held = {names.index(name): value for name, value in fixed.items()}
+    samples = np.zeros((draws, len(names)))
     for draw in range(draws):
-        times = np.bincount(rng.integers(len(labels), size=len(labels)), minlength=len(labels))
-        counted = times[member] * found.kept.astype(float)
-        theta, _ = maximise(data, counted, found.names, held, found.anchor, found.theta, defaults)
-        samples[draw] = theta * (found.weights[at] / theta[at])
+        drawn = rng.integers(len(labels), size=len(labels))
+        times = np.bincount(drawn, minlength=len(labels))[member] * found.kept.astype(float)
+        if times.any():
+            theta, _ = maximise(data, times, held, reference, found.defaults, found.theta)
+        else:
+            theta = found.theta
+        samples[draw] = theta * (found.defaults[at] / theta[at])
         if progress is not None:
             progress(draw + 1, draws)
     return samples

@@ -11,7 +11,7 @@ import pandas as pd
 
 from sumo_cohesion.errors import UserError
 from sumo_cohesion.learning.example import Example
-from sumo_cohesion.learning.fit import Fit, bootstrap, fit
+from sumo_cohesion.learning.fit import UNKNOWN, Fit, bootstrap, fit
 from sumo_cohesion.learning.learned import DIGITS, Learned
 from sumo_cohesion.learning.likelihood import Quadratics, quadratics
 from sumo_cohesion.learning.prediction import (
@@ -39,6 +39,7 @@ LEAST_MISFIT, MOST_MISFIT = 0.5, 2.0
 """Between these is the median of q / f where the reward describes the driving."""
 DOWN_TO_ZERO = 0.1
 """Share of a weight below which the lower end of its interval is as good as zero."""
+DOUBTED = "its interval reaches down to zero"
 INTERVAL = (0.05, 0.95)
 LEARNED, DEFAULT = "learned", "default"
 
@@ -76,10 +77,9 @@ class Material:
         """Return some of them."""
         return replace(self, segments=self.segments.where(chosen), data=self.data.where(chosen))
 
-    def fit(self, options: Options, held: Mapping[str, float] | None = None) -> Fit:
+    def fit(self, options: Options) -> Fit:
         """Fit the weights."""
-        fixed = options.fixed if held is None else held
-        return fit(self.data, self.names, self.defaults, fixed, options.keep)
+        return fit(self.data, self.names, self.defaults, options.fixed, options.keep)
 
 
 def learn_from(
@@ -174,33 +174,21 @@ def _doubted(
     material: Material, options: Options, say: Progress
 ) -> tuple[Fit, tuple[FloatArray, FloatArray] | None]:
     """Fit, and draw runs again; a weight that may as well be zero is not learned."""
-    held, why = dict(options.fixed), dict[str, str]()
-    while True:
-        found = material.fit(options, held)
-        found = replace(found, kept_default={**found.kept_default, **why})
-        if options.draws == 0 or len(set(material.segments.run)) < 2:
-            return found, None
-        fixed = {n: float(found.weights[found.names.index(n)]) for n in found.kept_default}
-        samples = bootstrap(
-            material.data,
-            material.segments.run,
-            found,
-            fixed,
-            material.defaults,
-            options.draws,
-            lambda done, total: say("drawing runs", done, total),
-        )
-        low, high = np.quantile(samples, INTERVAL, axis=0)
-        unsure = [
-            name
-            for name, bound, weight in zip(found.names, low, found.weights, strict=True)
-            if name not in found.kept_default and bound < DOWN_TO_ZERO * weight
-        ]
-        if not unsure:
-            return found, (low, high)
-        for name in unsure:
-            held[name] = float(material.defaults[found.names.index(name)])
-            why[name] = "its interval reaches down to zero"
+    found = material.fit(options)
+    if options.draws == 0 or len(set(material.segments.run)) < 2:
+        return found, None
+    samples = bootstrap(
+        material.data,
+        material.segments.run,
+        found,
+        options.fixed,
+        options.draws,
+        lambda done, total: say("drawing runs", done, total),
+    )
+    low, high = np.quantile(samples, INTERVAL, axis=0)
+    unsure = low < DOWN_TO_ZERO * found.weights
+    names = [n for n, so in zip(found.names, unsure, strict=True) if so]
+    return found.without({n: DOUBTED for n in names if n not in found.kept_default}), (low, high)
 
 
 def _tried(
@@ -217,15 +205,16 @@ def _tried(
     train = ~np.isin(material.segments.run, list(out))
     if not out or not train.any() or train.all():
         return pd.DataFrame(columns=_FIT_COLUMNS), pd.DataFrame(columns=_PREDICTION_COLUMNS)
-    fixed = {n: float(found.weights[found.names.index(n)]) for n in found.kept_default}
     seen = material.where(train)
-    trained = seen.fit(options, fixed)
+    trained = seen.fit(options)
+    # What all runs do not tell, some of them do not tell either.
+    trained = trained.without({n: UNKNOWN for n in found.kept_default if n not in options.fixed})
     default = material.defaults * best_scale(seen.data, material.defaults, options.keep)
     told = likelihoods(
         material.data,
         material.segments,
         train,
-        {LEARNED: trained.theta, DEFAULT: default},
+        {LEARNED: trained.scale * trained.weights, DEFAULT: default},
         options.keep,
     )
     # Plans end with their horizon; tracks can be followed for longer.
