@@ -273,8 +273,8 @@ def _weight_table(
             "term": found.names,
             "default": defaults,
             "learned": found.weights,
-            "low": np.where(free, _rounded(low, np.floor), np.nan),
-            "high": np.where(free, _rounded(high, np.ceil), np.nan),
+            "low": np.where(free, rounded(low, np.floor), np.nan),
+            "high": np.where(free, rounded(high, np.ceil), np.nan),
             "error": found.error,
             "identified": known,
             "kept_default": [found.kept_default.get(name, "") for name in found.names],
@@ -283,7 +283,7 @@ def _weight_table(
     ).astype({"term": "string", "kept_default": "string"})
 
 
-def _rounded(values: FloatArray, towards: Callable[[FloatArray], FloatArray]) -> FloatArray:
+def rounded(values: FloatArray, towards: Callable[[FloatArray], FloatArray]) -> FloatArray:
     """Round outwards to three digits: what a solver's tolerance leaves open is unknown, too."""
     digit = 10.0 ** (np.floor(np.log10(np.maximum(np.abs(values), 1e-300))) - 2.0)
     return towards(values / digit) * digit
