@@ -2,9 +2,9 @@
 
     python -m analysis.learn [--workers 2] [--real DIR] [--only recovery,claims]
 
-Four studies, each with tables in analysis/:
+Three studies, each with tables in analysis/:
 
-- recovery: nominal plans in real traffic, whose theta is known, are learned from: learn_recovery.csv
+- recovery: nominal's plans in SUMO traffic, whose theta is known: learn_recovery.csv
   (angle to the truth by number of segments), learn_coverage.csv (how often the 90 % interval of
   a bootstrap over runs holds the truth, in repetitions of other runs each), learn_speed.csv (CPU
   seconds).
@@ -66,7 +66,7 @@ def demonstrations(planner: str, workers: int | None) -> Path:
         "scenarios": list(SCENARIOS),
         "planners": [planner],
         "seeds": list(SEEDS),
-        "set": {"duration": SECONDS, "reference": False, "success": {"collision": False}},
+        "set": {"duration": SECONDS},
         "keep": ["trajectory", "plan", "horizon"],
     }
     batch(experiment, folder, workers=workers)
