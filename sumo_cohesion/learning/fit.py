@@ -61,7 +61,7 @@ class Fit:
     @property
     def weights(self) -> FloatArray:
         """(K,) what was learned, relative to the anchor, and the defaults of what was not."""
-        known = [name not in self.kept_default for name in self.names]
+        known = [self.kept_default.get(name, ASKED) == ASKED for name in self.names]
         return np.where(known, self.theta / self.scale, self.defaults)
 
     def without(self, why: Mapping[str, str]) -> Fit:

@@ -76,7 +76,7 @@ def make_segments(examples: Sequence[Example], settings: PlannerSettings) -> Seg
     """
     n_lanes = max((e.road.lane_centre.shape[1] for e in examples), default=1)
     layout, writer = StageParameters(settings, n_lanes), Transcription(settings, n_lanes)
-    bends, limit = layout.columns("road_curvature"), layout.columns("speed_limit")
+    bends = layout.columns("road_curvature")
     n, steps = len(examples), settings.horizon
     start, stages = np.zeros((n, 6)), np.zeros((n, steps, layout.size))
     low, high, change = (np.zeros((n, steps, 2)) for _ in range(3))
@@ -92,8 +92,6 @@ def make_segments(examples: Sequence[Example], settings: PlannerSettings) -> Seg
         start[i], stages[i] = instance.start, instance.stages
         low[i], high[i], change[i] = instance.low, instance.high, instance.change
         states[i, 0], states[i, 1:] = example.ego, example.states
-        if example.desired_speed is not None:
-            stages[i, :, limit] = example.desired_speed
         if not example.bounded:
             low[i], high[i], change[i] = -UNLIMITED, UNLIMITED, UNLIMITED
             # The control before is what it was, not what the planner's bounds would have left.
@@ -131,7 +129,7 @@ def problem_of(example: Example, settings: PlannerSettings, n_lanes: int) -> Pro
     return Problem(
         ego=ego,
         ego_size=example.ego_size,
-        road=_with_lanes(example.road.ahead(ego.s, ego.d, STEP * ego.speed, steps + 1), n_lanes),
+        road=_known_to(example, n_lanes, steps),
         cars=example.cars[: settings.cars],
         cohesion_weight=nothing,
         cohesion_target=nothing,
@@ -144,12 +142,17 @@ def problem_of(example: Example, settings: PlannerSettings, n_lanes: int) -> Pro
     )
 
 
-def _with_lanes(ahead: RoadAhead, n_lanes: int) -> RoadAhead:
-    """Return the same with more lanes, which do not exist: infinitely far and 1 m wide."""
+def _known_to(example: Example, n_lanes: int, steps: int) -> RoadAhead:
+    """Return the road ahead as its driver sees it, with the speed that it would like to drive.
+
+    Lanes that the road does not have are infinitely far and 1 m wide.
+    """
+    ego = example.ego
+    ahead = example.road.ahead(ego.s, ego.d, STEP * ego.speed, steps + 1)
     have, n = (ahead.rows.shape[1] - 2) // 2, len(ahead.rows)
-    if have == n_lanes:
-        return ahead
     centres, widths, rest = np.split(ahead.rows, [have, 2 * have], axis=1)
+    if example.desired_speed is not None:
+        rest = np.column_stack((np.full(n, example.desired_speed), rest[:, 1]))
     none = np.full((n, n_lanes - have), np.inf)
     return RoadAhead(np.hstack((centres, none, widths, np.ones_like(none), rest)), ahead.edges)
 
