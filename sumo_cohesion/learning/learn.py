@@ -41,7 +41,9 @@ DOWN_TO_ZERO = 0.1
 """Share of a weight below which the lower end of its interval is as good as zero."""
 DOUBTED = "its interval reaches down to zero"
 INTERVAL = (0.05, 0.95)
-LEARNED, DEFAULT = "learned", "default"
+LEARNED, FITTED, DEFAULT = "learned", "as fitted", "default"
+"""Models: what is learned, with defaults in place of what the demonstrations do not tell; the same
+without them; and the default weights."""
 
 
 @dataclass(frozen=True)
@@ -109,7 +111,7 @@ def learn_from(
     rows = _segment_table(segments, found)
     runs = len(set(material.segments.run))
     return Learned(
-        reward=_reward(found),
+        reward=_reward(found.names, found.weights),
         temperature=1.0 / found.scale,
         weights=_weight_table(found, material.defaults, interval),
         segments=rows,
@@ -214,7 +216,11 @@ def _tried(
         material.data,
         material.segments,
         train,
-        {LEARNED: trained.scale * trained.weights, DEFAULT: default},
+        {
+            LEARNED: trained.scale * trained.weights,
+            FITTED: trained.theta,
+            DEFAULT: default,
+        },
         options.keep,
     )
     # Plans end with their horizon; tracks can be followed for longer.
@@ -224,7 +230,11 @@ def _tried(
     predictions = displacements(
         spread_out(windows),
         settings.model_copy(update={"horizon": longest.steps}),
-        {LEARNED: _reward(trained), DEFAULT: RewardWeights()},
+        {
+            LEARNED: _reward(trained.names, trained.weights),
+            FITTED: _reward(trained.names, trained.theta / trained.scale),
+            DEFAULT: RewardWeights(),
+        },
     )
     say("predicting", 1, 1)
     return _fit_table(told, predictions), predictions
@@ -238,8 +248,8 @@ def _held_out(runs: Sequence[str], share: float) -> set[str]:
     return set(sorted(runs, key=lambda r: hashlib.sha256(r.encode()).digest())[:count])
 
 
-def _reward(found: Fit) -> RewardWeights:
-    pairs = zip(found.names, found.weights, strict=True)
+def _reward(names: Sequence[str], weights: FloatArray) -> RewardWeights:
+    pairs = zip(names, weights, strict=True)
     return RewardWeights(**{name: float(f"{weight:.{DIGITS}g}") for name, weight in pairs})
 
 
