@@ -111,8 +111,9 @@ def recovery(workers: int | None) -> dict[str, pd.DataFrame]:
                     "demonstrations": kind,
                     "segments": count,
                     "repetitions": SUBSETS,
-                    "angle_median": np.median(angles),
-                    "angle_90": np.quantile(angles, 0.9),
+                    "found": int(np.isfinite(angles).sum()),
+                    "angle_median": np.nanmedian(angles),
+                    "angle_90": np.nanquantile(angles, 0.9),
                     **dict(zip(NAMES, np.nanmedian(np.array(weights), axis=0), strict=True)),
                 }
             )
@@ -131,6 +132,8 @@ def learned_from(data: Quadratics) -> tuple[float, FloatArray]:
     known = np.array([name not in found.kept_default for name in NAMES])
     ratio = found.weights / TRUTH
     own = ratio[known]
+    if len(own) < 2:
+        return np.nan, np.full(len(NAMES), np.nan)
     cosine = own.sum() / np.linalg.norm(own) / np.sqrt(len(own))
     return float(np.degrees(np.arccos(min(cosine, 1.0)))), np.where(known, ratio, np.nan)
 

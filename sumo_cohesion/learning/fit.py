@@ -21,6 +21,8 @@ UNCERTAIN = 1.0
 """Standard error of a weight's logarithm above which the data do not tell it."""
 _FURTHEST = 18.0
 """How far (natural logarithm) a weight may fall from where it starts: 8 powers of ten."""
+_LONGEST_STEP = 3.0
+"""Of the search, in natural logarithms: no number overflows."""
 ASKED, UNKNOWN = "as asked for", "the demonstrations do not tell it"
 """Why a weight was not learned."""
 
@@ -182,9 +184,8 @@ def maximise(
     # The best common scale has a closed form: q and log|A| are simple in it.
     misfit = float(counts @ score(some, (columns * np.exp(x0)).sum(axis=1), counts).misfit)
     x0 += np.log(total / misfit) if misfit > 0.0 else 0.0
-    x = minimize(
-        loss, x0, jac=True, hess=bend, method="trust-exact", options={"maxiter": 200, "gtol": 1e-7}
-    ).x
+    options = {"maxiter": 200, "gtol": 1e-7, "max_trust_radius": _LONGEST_STEP}
+    x = minimize(loss, x0, jac=True, hess=bend, method="trust-exact", options=options).x
     error = np.zeros(len(defaults))
     error[free] = np.where(x - x0 < -_FURTHEST, np.inf, _errors(total * bend(x)))
     return (columns * np.exp(x)).sum(axis=1), error

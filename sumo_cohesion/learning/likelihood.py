@@ -24,6 +24,8 @@ from sumo_cohesion.planning.solvers.compiled import BUILDING
 from sumo_cohesion.planning.stage import N_STATES, StageParameters, make_stage
 from sumo_cohesion.state import BoolArray, FloatArray
 
+ROUNDING = 1e-10
+"""Error of a scaled control from rounding: without any, exact optima would have no temperature."""
 _AT_ONCE = 20_000
 """Stages that are worked out at once."""
 
@@ -181,12 +183,13 @@ def score(
     inverse = np.linalg.inv(curvature)
     _, log_determinant = np.linalg.slogdet(curvature)
     v = (inverse @ (theta @ data.gradient)[:, :, None])[:, :, 0]
-    misfit = ((theta @ data.gradient) * v).sum(axis=1)
+    spread = np.trace(data.curvature, axis1=2, axis2=3) * ROUNDING**2
+    misfit = ((theta @ data.gradient) * v).sum(axis=1) + spread @ theta
     each = 0.5 * (log_determinant - misfit - data.free * np.log(2.0 * np.pi))
     # d/dk: -G_k' v + 1/2 v' A_k v + 1/2 tr(A^-1 A_k)
     pushed = (data.curvature @ v[:, None, :, None])[:, :, :, 0]
-    spread = (flat @ inverse.reshape(n, size * size, 1))[:, :, 0]
-    slopes = ((0.5 * pushed - data.gradient) @ v[:, :, None])[:, :, 0] + 0.5 * spread
+    volume = (flat @ inverse.reshape(n, size * size, 1))[:, :, 0]
+    slopes = ((0.5 * pushed - data.gradient) @ v[:, :, None])[:, :, 0] + 0.5 * (volume - spread)
     hessian = None
     if with_hessian:
         # -(G_k - A_k v)' A^-1 (G_l - A_l v) - 1/2 tr(A^-1 A_k A^-1 A_l)
