@@ -96,9 +96,12 @@ def learn(
     """
     from sumo_cohesion.demonstrations import learn as learning
     from sumo_cohesion.learning.learned import require_writable
+    from sumo_cohesion.tables.folders import require_replaceable
     from sumo_cohesion.user_input import split_names
 
     require_writable(out)
+    if report is not None:
+        require_replaceable(report, "--report")
     with clean_stdout(), progress_bar("learn") as progress:
 
         def follow(what: str, done: int, total: int) -> None:
@@ -120,11 +123,14 @@ def learn(
             overrides=options.parsed_overrides(changes),
             progress=follow,
         )
-        learned.write(out)
-        if report is not None:
-            from sumo_cohesion.report.learned import write_report
+        try:
+            if report is not None:  # first: the file may lie in its folder
+                from sumo_cohesion.report.learned import write_report
 
-            write_report(learned, report)
+                progress(0, 1, what="drawing")
+                write_report(learned, report)
+        finally:
+            learned.write(out)
     for note in (*learned.about["notes"], *learned.warnings):
         click.echo(f"note: {note}", err=True)
     if as_json:
