@@ -118,7 +118,13 @@ WEIGHTS = (
     Column("learned", "float64", "", "the weight; the lane's, as a rule, is one"),
     Column("low", "float64", "", "5 % quantile of a bootstrap over runs; NaN if there is none"),
     Column("high", "float64", "", "95 % quantile of it"),
-    Column("error", "float64", "", "standard error of the weight's logarithm, by the curvature"),
+    Column(
+        "error",
+        "float64",
+        "",
+        "standard error of the weight's logarithm, from the likelihood's curvature; 0 of what is "
+        "held and of what the others are relative to",
+    ),
     Column("identified", "bool", "", "learned, or what the others are relative to"),
     Column("kept_default", "string", "", "why it was not learned; or empty"),
     Column("share", "float64", "", "of the reward's curvature, mean of the segments that are kept"),
