@@ -13,6 +13,7 @@ import pytest
 from analysis import markdown
 from sumo_cohesion import cli
 from sumo_cohesion.batches.experiment import Experiment, RunLimits, load_experiment, spell_out
+from sumo_cohesion.cli import learning
 from sumo_cohesion.simulation.scenario import Scenario
 from sumo_cohesion.tables.columns import describe_tables
 from tests.conftest import ROOT
@@ -145,6 +146,50 @@ def test_batches_page_shows_every_key_and_its_code_runs(
     (code,) = blocks(page, "python")
     exec(compile(code, "batches.md", "exec"), {"__name__": "batches"})
     assert "p_adjusted" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_the_learning_pages_commands_and_code_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    page = (ROOT / "docs" / "learning.md").read_text(encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    (experiment,) = blocks(page, "toml")
+    assert len(spell_out(load_experiment(tomllib.loads(experiment))).plan) == 4 * 4
+    # The same runs, fewer and shorter ones, and all that can be told of as few.
+    short = experiment.replace(', "exit", "ambulance"', "").replace("1000:1004", "1000:1002")
+    (tmp_path / "demos.toml").write_text(short + "[set]\nduration = 4.0\n")
+    few = {
+        "learn": ["--bootstrap", "2"],
+        "tune": ["--seeds", "1000:1001", "--set", "duration=16.0"],
+        "compare": ["--seeds", "7:8", "--set", "duration=2.0"],
+    }
+    (commands,) = [block.splitlines() for block in blocks(page, "sh")]
+    assert len(commands) == 4
+    for command in commands:
+        words = shlex.split(command, comments=True)
+        monkeypatch.setattr(sys, "argv", words + few.get(words[1], []))
+        cli.main()
+    theta = tomllib.loads((tmp_path / "theta.toml").read_text())
+    assert theta["planner"]["reward"]["lane"] == 1.0
+    assert theta["learned"]["runs"] == 4
+    assert theta["cohesion"]["beta"] > 0.0
+    assert (tmp_path / "learned" / "weights.png").stat().st_size > 10_000
+    capsys.readouterr()
+    (code,) = blocks(page, "python")
+    names: dict[str, object] = {"__name__": "learning"}
+    exec(compile(code, "learning.md", "exec"), names)
+    assert "kept_default" in capsys.readouterr().out
+    weights = names["rollout"].info["settings"]["reward"]  # type: ignore[attr-defined]
+    assert weights == names["learned"].reward.model_dump()  # type: ignore[attr-defined]
+
+
+def test_the_learning_page_names_every_option() -> None:
+    page = (ROOT / "docs" / "learning.md").read_text(encoding="utf-8")
+    (options,) = re.findall(r"## Options\n(.*?)\n#", page, flags=re.DOTALL)
+    told = set(re.findall(r"^\| (.*?) \|", options, flags=re.MULTILINE))
+    named = {name for cell in told for name in re.findall(r"`(--[\w-]+)`", cell)}
+    assert named == {o for p in learning.learn.params for o in p.opts if o.startswith("--")}
 
 
 def test_the_examples_are_valid() -> None:

@@ -45,7 +45,11 @@ Kind = Literal["plans", "driven", "humans"]
     type=click.Path(path_type=Path),
     help="File with the types of SUMO's vehicles, for their sizes.",
 )
-@click.option("--steps", type=int, help="Of 0.1 s per segment. Default: the plans' horizon; 10.")
+@click.option(
+    "--steps",
+    type=click.IntRange(2, 100),
+    help="Of 0.1 s per segment. Default: the plans' horizon; 10.",
+)
 @click.option(
     "--smooth",
     metavar="ALONG,ACROSS",
@@ -61,13 +65,24 @@ Kind = Literal["plans", "driven", "humans"]
 @click.option("--also", metavar="TERMS", default="", help="Terms to learn that are off by default.")
 @click.option("--fix", multiple=True, metavar="TERM=WEIGHT", help="A weight that is not learned.")
 @click.option(
-    "--keep", type=float, help="Share of the segments to fit. Default: 0.85; 0.95 of humans."
+    "--keep",
+    type=click.FloatRange(0.1, 1.0),
+    help="Share of the segments to fit. Default: 0.85; 0.95 of humans.",
 )
 @click.option(
-    "--hold-out", type=float, default=0.25, show_default=True, help="Share of runs to try it on."
+    "--hold-out",
+    type=click.FloatRange(0.0, 0.9),
+    default=0.25,
+    show_default=True,
+    help="Share of runs to try it on.",
 )
 @click.option(
-    "--bootstrap", "draws", type=int, default=100, show_default=True, help="Draws; 0: no intervals."
+    "--bootstrap",
+    "draws",
+    type=click.IntRange(0, 100_000),
+    default=100,
+    show_default=True,
+    help="Draws; 0: no intervals.",
 )
 @options.changes
 @click.option("--json", "as_json", is_flag=True, help="Print weights and fit as JSON.")
@@ -96,9 +111,12 @@ def learn(
     """
     from sumo_cohesion.demonstrations import learn as learning
     from sumo_cohesion.learning.learned import require_writable
+    from sumo_cohesion.tables.folders import require_replaceable
     from sumo_cohesion.user_input import split_names
 
     require_writable(out)
+    if report is not None:
+        require_replaceable(report, "--report")
     with clean_stdout(), progress_bar("learn") as progress:
 
         def follow(what: str, done: int, total: int) -> None:
@@ -120,11 +138,14 @@ def learn(
             overrides=options.parsed_overrides(changes),
             progress=follow,
         )
-        learned.write(out)
-        if report is not None:
-            from sumo_cohesion.report.learned import write_report
+        try:
+            if report is not None:  # first: the file may lie in its folder
+                from sumo_cohesion.report.learned import write_report
 
-            write_report(learned, report)
+                progress(0, 1, what="drawing")
+                write_report(learned, report)
+        finally:
+            learned.write(out)
     for note in (*learned.about["notes"], *learned.warnings):
         click.echo(f"note: {note}", err=True)
     if as_json:

@@ -28,6 +28,7 @@ from sumo_cohesion.learning.tracks import Cutting
 from sumo_cohesion.planning.reward import RewardWeights
 from sumo_cohesion.planning.settings import PlannerSettings
 from sumo_cohesion.state import STEP, BoolArray, FloatArray
+from sumo_cohesion.tables.columns import as_table
 from sumo_cohesion.versions import versions
 
 Progress = Callable[[str, int, int], None]
@@ -108,7 +109,7 @@ def learn_from(
             raise UserError(f"--fix: there is no term {name!r} in use; terms are {known}")
     found, interval = _doubted(material, options, say)
     table, predictions = _tried(sources, how, settings, material, found, options, say)
-    rows = _segment_table(segments, found)
+    rows = _segment_table(segments, found, material.data.free)
     runs = len(set(material.segments.run))
     return Learned(
         reward=_reward(found.names, found.weights),
@@ -206,7 +207,7 @@ def _tried(
     out = _held_out(sorted(set(material.segments.run)), options.hold_out)
     train = ~np.isin(material.segments.run, list(out))
     if not out or not train.any() or train.all():
-        return pd.DataFrame(columns=_FIT_COLUMNS), pd.DataFrame(columns=_PREDICTION_COLUMNS)
+        return as_table("fit", []), as_table("predictions", [])
     seen = material.where(train)
     trained = seen.fit(options)
     # What all runs do not tell, some of them do not tell either.
@@ -253,10 +254,6 @@ def _reward(names: Sequence[str], weights: FloatArray) -> RewardWeights:
     return RewardWeights(**{name: float(f"{weight:.{DIGITS}g}") for name, weight in pairs})
 
 
-_FIT_COLUMNS = ("model", "log_likelihood", *[f"off_{h:g}s" for h in HORIZONS], "windows")
-_PREDICTION_COLUMNS = ("example", "run", "model", "horizon", "off")
-
-
 def _fit_table(told: Mapping[str, float], predictions: pd.DataFrame) -> pd.DataFrame:
     """One row per model: median log-likelihood per second, mean displacements (m)."""
     off = predictions.pivot_table(index="model", columns="horizon", values="off", aggfunc="mean")
@@ -268,7 +265,7 @@ def _fit_table(told: Mapping[str, float], predictions: pd.DataFrame) -> pd.DataF
             known = model in off.index and horizon in off.columns
             row[f"off_{horizon:g}s"] = off.loc[model, horizon] if known else np.nan
         rows.append({**row, "windows": int(windows.get(model, 0))})
-    return pd.DataFrame(rows, columns=_FIT_COLUMNS).astype({"model": "string"})
+    return as_table("fit", rows)
 
 
 def _weight_table(
@@ -278,7 +275,8 @@ def _weight_table(
     low, high = interval or (nothing, nothing)
     known = [name not in found.kept_default for name in found.names]
     free = [name not in found.kept_default and name != found.anchor for name in found.names]
-    return pd.DataFrame(
+    return as_table(
+        "weights",
         {
             "term": found.names,
             "default": defaults,
@@ -289,8 +287,8 @@ def _weight_table(
             "identified": known,
             "kept_default": [found.kept_default.get(name, "") for name in found.names],
             "share": found.share,
-        }
-    ).astype({"term": "string", "kept_default": "string"})
+        },
+    )
 
 
 def rounded(values: FloatArray, towards: Callable[[FloatArray], FloatArray]) -> FloatArray:
@@ -299,23 +297,26 @@ def rounded(values: FloatArray, towards: Callable[[FloatArray], FloatArray]) -> 
     return towards(values / digit) * digit
 
 
-def _segment_table(segments: Segments, found: Fit) -> pd.DataFrame:
+def _segment_table(segments: Segments, found: Fit, free: FloatArray) -> pd.DataFrame:
     usable = segments.dropped == ""
-    each, misfit = (np.full(len(segments), np.nan) for _ in range(2))
+    each, misfit, free_of = (np.full(len(segments), np.nan) for _ in range(3))
     kept = np.zeros(len(segments), dtype=bool)
     each[usable], misfit[usable], kept[usable] = found.each, found.misfit, found.kept
+    free_of[usable] = free
     reason = np.where(usable & ~kept, "trimmed", segments.dropped)
-    return pd.DataFrame(
+    return as_table(
+        "segments",
         {
             "run": segments.run,
             "vehicle": segments.vehicle,
             "time": segments.time,
             "log_likelihood": each,
+            "free": free_of,
             "misfit": misfit,
             "kept": kept,
             "reason": reason,
-        }
-    ).astype(dict.fromkeys(("run", "vehicle", "reason"), "string"))
+        },
+    )
 
 
 def _warnings(

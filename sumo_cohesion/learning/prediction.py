@@ -16,6 +16,7 @@ from sumo_cohesion.planning.reward import RewardWeights
 from sumo_cohesion.planning.settings import PlannerSettings
 from sumo_cohesion.planning.solvers.mpc import Mpc
 from sumo_cohesion.state import STEP, BoolArray, Control, FloatArray, RoadState
+from sumo_cohesion.tables.columns import as_table
 
 HORIZONS = (1.0, 2.0, 3.0)
 """Seconds after which a prediction is compared with what was driven."""
@@ -116,8 +117,9 @@ def displacements(
             for horizon in horizons:
                 at = round(horizon / STEP) - 1
                 off = float(np.hypot(*(places[at] - example.states[at, :2])))
-                rows.append((i, example.run, name, horizon, off))
-    return pd.DataFrame(rows, columns=["example", "run", "model", "horizon", "off"])
+                whose = {"example": i, "run": example.run, "model": name}
+                rows.append({**whose, "horizon": horizon, "off": off})
+    return as_table("predictions", rows)
 
 
 def _driven_on(example: Example, control: Control | None, settings: PlannerSettings) -> FloatArray:

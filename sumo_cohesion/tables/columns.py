@@ -112,6 +112,60 @@ BATCH = (
 )
 """Columns before those of a run's metrics. In a run without result all metrics are missing."""
 
+WEIGHTS = (
+    Column("term", "string", "", "of the reward: its weight is the setting planner.reward.TERM"),
+    Column("default", "float64", "", "the package's own weight; 0 is off"),
+    Column("learned", "float64", "", "the weight; the lane's, as a rule, is one"),
+    Column("low", "float64", "", "5 % quantile of a bootstrap over runs; NaN if there is none"),
+    Column("high", "float64", "", "95 % quantile of it"),
+    Column(
+        "error",
+        "float64",
+        "",
+        "standard error of the weight's logarithm, from the likelihood's curvature; 0 of what is "
+        "held and of what the others are relative to",
+    ),
+    Column("identified", "bool", "", "learned, or what the others are relative to"),
+    Column("kept_default", "string", "", "why it was not learned; or empty"),
+    Column("share", "float64", "", "of the reward's curvature, mean of the segments that are kept"),
+)
+
+SEGMENTS = (
+    Column("run", "string", "", "run, file or vehicle; what the bootstrap draws"),
+    Column("vehicle", "string", "", "whose driving"),
+    Column("time", "float64", "s", "when it begins"),
+    Column("log_likelihood", "float64", "nats", "of its scaled controls; NaN if it was dropped"),
+    Column("free", "float64", "", "f, controls that no bound holds; NaN if it was dropped"),
+    Column("misfit", "float64", "", "q / f, about one where the reward fits; NaN if dropped"),
+    Column("kept", "bool", "", "part of the last fit"),
+    Column("reason", "string", "", "if not: trimmed, or why it was dropped; or empty"),
+)
+
+FIT = (
+    Column("model", "string", "", "learned, default (at its best scale), or one without a reward"),
+    Column("log_likelihood", "float64", "nats/s", "median of the segments that were held out"),
+    Column("off_1s", "float64", "m", "mean distance of prediction and driving after 1 s"),
+    Column("off_2s", "float64", "m", "after 2 s; NaN if segments are shorter"),
+    Column("off_3s", "float64", "m", "after 3 s; NaN if segments are shorter"),
+    Column("windows", "int64", "", "how many pieces of driving were predicted"),
+)
+
+PREDICTIONS = (
+    Column("example", "int64", "", "which piece of driving that was held out"),
+    Column("run", "string", "", "as in segments"),
+    Column("model", "string", "", "as in fit"),
+    Column("horizon", "float64", "s", "how far ahead"),
+    Column("off", "float64", "m", "distance of prediction and driving"),
+)
+
+LEARNED: dict[str, Sequence[Column]] = {
+    "weights": WEIGHTS,
+    "segments": SEGMENTS,
+    "fit": FIT,
+    "predictions": PREDICTIONS,
+}
+"""What learn finds; those of a run are apart."""
+
 TABLES: dict[str, Sequence[Column]] = {
     "trajectory": TRAJECTORY,
     "plan": PLAN,
@@ -134,7 +188,7 @@ def as_table(
 
     told = data if isinstance(data, Mapping) else {key: None for row in data for key in row}
     dtypes: dict[str, str] = {}
-    for column in TABLES[name]:
+    for column in (TABLES | LEARNED)[name]:
         if column.name.endswith("*"):
             found = [key for key in told if key.startswith(column.name[:-1])]
             dtypes |= dict.fromkeys(found, column.dtype)
@@ -153,8 +207,10 @@ def describe_tables() -> str:
         "A batch's metrics have the columns of `batch`, then scenario, planner, the names of the",
         "grid and seed, then the rest of `metrics`. Tables that a batch kept have the column `run`",
         "too; its table `ego` is the ego's part of `trajectory`.\n",
+        "`weights`, `segments`, `fit` and `predictions` are what `learn` finds",
+        "([learning.md](learning.md)); it writes them with `--report`.\n",
     ]
-    for name, columns in {**TABLES, "batch": BATCH}.items():
+    for name, columns in {**TABLES, "batch": BATCH, **LEARNED}.items():
         parts += [f"## {name}\n", "| column | type | unit | meaning |", "|---|---|---|---|"]
         parts += [f"| {c.name} | {c.dtype} | {c.unit} | {c.meaning} |" for c in columns]
         parts.append("")

@@ -22,20 +22,21 @@ BATCH_FILE = "manifest.json"
 """File of a batch's folder (batches.store), which is gone on with and never replaced."""
 
 
-def require_replaceable(folder: Path) -> None:
+def require_replaceable(folder: Path, option: str = "--out") -> None:
     """Raise UserError unless a result can be written to a folder; its parents are made.
 
-    That is one that is not there yet, is empty, or holds an earlier result.
+    That is one that is not there yet, is empty, or holds an earlier result. ``option`` is the
+    command line's, to choose another with.
     """
     try:
         holds_other = folder.is_dir() and any(folder.iterdir()) and not _is_result(folder)
         if holds_other or (folder.exists() and not folder.is_dir()):
             raise UserError(
-                f"{folder}: holds something else than an earlier result; choose another --out"
+                f"{folder}: holds something else than an earlier result; choose another {option}"
             )
         _new_beside(folder.resolve()).rmdir()
     except OSError as error:
-        raise _cannot_write(folder, error) from None
+        raise _cannot_write(folder, error, option) from None
 
 
 class whole_folder:  # noqa: N801 - reads as a function where it is used
@@ -45,8 +46,8 @@ class whole_folder:  # noqa: N801 - reads as a function where it is used
     refuses, the new files are kept and the UserError says where.
     """
 
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
+    def __init__(self, folder: Path, option: str = "--out") -> None:
+        self._folder, self._option = folder, option
 
     def __enter__(self) -> Path:
         try:
@@ -54,7 +55,7 @@ class whole_folder:  # noqa: N801 - reads as a function where it is used
             self._new = _new_beside(self._target)
             self._new.chmod(0o755)
         except OSError as error:
-            raise _cannot_write(self._folder, error) from None
+            raise _cannot_write(self._folder, error, self._option) from None
         return self._new
 
     def __exit__(
@@ -66,7 +67,7 @@ class whole_folder:  # noqa: N801 - reads as a function where it is used
         if kind is not None:
             shutil.rmtree(self._new, ignore_errors=True)
             if isinstance(error, OSError):
-                raise _cannot_write(self._folder, error) from None
+                raise _cannot_write(self._folder, error, self._option) from None
             return
         try:
             _list_files(self._new)
@@ -80,7 +81,8 @@ class whole_folder:  # noqa: N801 - reads as a function where it is used
                 raise
             said = problem.strerror or problem if isinstance(problem, OSError) else problem
             raise UserError(
-                f"{self._folder}: {said}; the new result is kept in {kept}; choose another --out"
+                f"{self._folder}: {said}; the new result is kept in {kept}; choose another "
+                f"{self._option}"
             ) from None
 
 
@@ -193,8 +195,8 @@ def _remove_emptied(folder: Path, names: list[str]) -> None:
                 parent.rmdir()
 
 
-def _cannot_write(folder: Path, error: OSError) -> UserError:
+def _cannot_write(folder: Path, error: OSError, option: str) -> UserError:
     return UserError(
         f"{folder}: cannot write there ({error.strerror or error}); free some space or choose "
-        "another --out"
+        f"another {option}"
     )

@@ -179,7 +179,8 @@ def test_listing_scenarios_is_light() -> None:
 
 
 @pytest.mark.parametrize(
-    "arguments", [["--help"], ["run", "--help"], ["batch", "--help"], ["tune", "-h"]]
+    "arguments",
+    [["--help"], ["run", "--help"], ["batch", "--help"], ["tune", "-h"], ["learn", "-h"]],
 )
 def test_help_is_light(arguments: list[str]) -> None:
     assert not heavy_after(*arguments)
