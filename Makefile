@@ -5,7 +5,7 @@ NETCONVERT := $(BIN)/netconvert --offset.disable-normalization true --no-turnaro
 # Threads of the linear algebra library only cost time here: the matrices are tiny.
 export OPENBLAS_NUM_THREADS := 1
 
-.PHONY: demo test test-quick lint check faults fuzz format networks docs lock wheel benchmark benchmark-planner reproduce ablation horizon figures example clean
+.PHONY: demo test test-quick lint check faults fuzz format networks docs lock wheel benchmark benchmark-planner reproduce ablation horizon learn figures example clean
 
 demo: $(VENV)/.installed
 	$(BIN)/sumo-cohesion compare stalled --seeds 0:8 --out demo
@@ -73,6 +73,13 @@ ablation: $(VENV)/.installed
 # How far ahead to plan, and on which transitions to be cohesive: ten minutes.
 horizon: $(VENV)/.installed
 	$(BIN)/python -m analysis.horizon
+	$(BIN)/python -m analysis.markdown
+
+# What can be learned of theta, and the claims with it: half an hour. Real humans are CommonRoad
+# scenes in a folder: make learn REAL=folder (docs/learning.md says which were used).
+REAL ?=
+learn: $(VENV)/.installed
+	$(BIN)/python -m analysis.learn $(if $(REAL),--real $(REAL))
 	$(BIN)/python -m analysis.markdown
 
 figures: $(VENV)/.installed

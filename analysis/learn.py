@@ -49,7 +49,7 @@ from sumo_cohesion.versions import versions
 
 WORK = HERE.parent / "results" / "learn"
 SCENARIOS = ("stalled_swerve", "ambulance", "speeding", "exit", "nothing_to_follow", "same_speed")
-SEEDS = range(1000, 1040)
+SEEDS, LEARN_SEEDS = range(1000, 1040), range(1000, 1008)
 CLAIM_SEEDS = range(20)
 SECONDS = 20.0
 TEMPERATURE = 1e-3
@@ -59,13 +59,13 @@ REPETITIONS, DRAWS = 20, 100
 NAMES, TRUTH = RewardWeights().in_use, np.array(RewardWeights().theta)
 
 
-def demonstrations(planner: str, workers: int | None) -> Path:
-    """Drive every scenario on all seeds; what is done is not done again."""
-    folder = WORK / planner
+def demonstrations(planner: str, seeds: range, workers: int | None) -> Path:
+    """Drive every scenario; what is done is not done again."""
+    folder = WORK / f"{planner}-{len(seeds)}"
     experiment = {
         "scenarios": list(SCENARIOS),
         "planners": [planner],
-        "seeds": list(SEEDS),
+        "seeds": list(seeds),
         "set": {"duration": SECONDS},
         "keep": ["trajectory", "plan", "horizon"],
     }
@@ -75,7 +75,7 @@ def demonstrations(planner: str, workers: int | None) -> Path:
 
 def recovery(workers: int | None) -> dict[str, pd.DataFrame]:
     """Learn from plans, exact and noisy, and from what was driven: theta is known."""
-    runs = runs_in(demonstrations("nominal", workers))
+    runs = runs_in(demonstrations("nominal", SEEDS, workers))
     settings = PlannerSettings()
     settings = settings.model_copy(update={"reward": settings.reward.shape})
     rng = np.random.default_rng(0)
@@ -219,8 +219,8 @@ def learned(workers: int | None, real: Path | None) -> dict[str, Learned]:
     """Learn theta from a planner's plans, from SUMO's humans, from real ones if there are any."""
     humans: dict[str, Any] = {"source": "humans", "desired": "own"}
     found = {
-        "plans": learn(demonstrations("nominal", workers)),
-        "SUMO's humans": learn(demonstrations("sumo", workers), **humans),
+        "plans": learn(demonstrations("nominal", LEARN_SEEDS, workers)),
+        "SUMO's humans": learn(demonstrations("sumo", LEARN_SEEDS, workers), **humans),
     }
     if real is not None:
         scenes = sorted(real.glob("*.xml"))
@@ -278,7 +278,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     about = {
         "command": f"python -m analysis.learn --only {given.only}"
         + (" --real DIR" if given.real else ""),
-        "demonstrations": f"seeds {SEEDS[0]}:{SEEDS[-1] + 1}",
+        "recovery": f"demonstrations of seeds {SEEDS[0]}:{SEEDS[-1] + 1}",
+        "learned": f"demonstrations of seeds {LEARN_SEEDS[0]}:{LEARN_SEEDS[-1] + 1}",
         "tuned_on": "seeds 1000:1010",
         "claims": f"seeds {CLAIM_SEEDS[0]}:{CLAIM_SEEDS[-1] + 1}",
         "versions": versions(),

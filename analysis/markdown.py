@@ -1,4 +1,4 @@
-"""The tables of docs/evidence.md and docs/planner.md, made of analysis/*.csv and benchmarks/*.csv.
+"""Tables of docs/evidence.md, planner.md and learning.md, made of analysis/ and benchmarks/.
 
     python -m analysis.markdown
 
@@ -15,6 +15,7 @@ import pandas as pd
 HERE = Path(__file__).resolve().parent
 DOCS = HERE.parent / "docs"
 EVIDENCE, PLANNER = DOCS / "evidence.md", DOCS / "planner.md"
+LEARNING = DOCS / "learning.md"
 BENCHMARKS = HERE.parent / "benchmarks"
 CONTACT = "touches a car that it can see"
 PLANNERS = ("nominal", "cohesive", "paper", "sumo")
@@ -102,9 +103,110 @@ def rooms_sentence(report: str) -> str:
     )
 
 
+def _rows(heads: list[str], rows: list[list[str]]) -> str:
+    """Return a table in Markdown."""
+    lines = [heads, ["---"] * len(heads), *rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def recovery_table(recovery: pd.DataFrame, coverage: pd.DataFrame) -> str:
+    """Angles to the true weights by number of segments; how often intervals hold the truth."""
+    counts = sorted(recovery["segments"].unique())
+    rows = []
+    for kind, found in recovery.groupby("demonstrations", sort=False):
+        by_count = found.set_index("segments")
+        cells = [
+            f"{by_count['angle_median'][n]:.2g}° ({by_count['angle_90'][n]:.2g}°)"
+            if n in by_count.index
+            else "-"
+            for n in counts
+        ]
+        rows.append([str(kind), *cells])
+    angles = _rows(["learned from", *[f"{n} segments" for n in counts]], rows)
+    terms = list(dict.fromkeys(coverage["term"]))
+    rows = []
+    for kind, found in coverage.groupby("demonstrations", sort=False):
+        by_term = found.set_index("term")
+        cells = [
+            f"{by_term['held'][t]} of {by_term['repetitions'][t]}" if t in by_term.index else "-"
+            for t in terms
+        ]
+        rows.append([str(kind), *cells])
+    return angles + "\n\n" + _rows(["interval holds the truth", *terms], rows)
+
+
+def speed_table(speed: pd.DataFrame) -> str:
+    """CPU seconds of each part of the work."""
+    n = int(speed["segments"].iloc[0])
+    rows = [[str(r.work), f"{r.seconds:.1f}"] for r in speed.itertuples()]
+    return _rows([f"{n} segments of 10 steps", "CPU seconds"], rows)
+
+
+def learned_weights_table(weights: pd.DataFrame) -> str:
+    """One row per term, a column per theta: the weight, in brackets where it is the default."""
+    thetas = list(dict.fromkeys(weights["theta"]))
+    rows = []
+    for term, found in weights.groupby("term", sort=False):
+        by_theta = found.set_index("theta")
+        cells = []
+        for theta in thetas:
+            if theta not in by_theta.index:
+                cells.append("-")
+                continue
+            row = by_theta.loc[theta]
+            cells.append(f"{row['learned']:.3g}" if row["identified"] else f"({row['learned']:g})")
+        rows.append([f"`{term}`", f"{found['default'].iloc[0]:g}", *cells])
+    return _rows(["term", "hand-set", *thetas], rows)
+
+
+def learned_claims_table(claims: pd.DataFrame) -> str:
+    """One row per claim and case; of every theta nominal's and cohesive's counts."""
+    thetas = list(dict.fromkeys(claims["theta"]))
+    betas = claims.groupby("theta")["beta"].first()
+    heads = [t if pd.isna(betas[t]) else f"{t}, β = {betas[t]:.3g}" for t in thetas]
+    n = int(claims["n"].iloc[0])
+    rows = []
+    told = claims[claims["claim"] != CONTACT]
+    for (claim, case), found in told.groupby(["claim", "case"], sort=False):
+        cells = []
+        for theta in thetas:
+            counts = found[found["theta"] == theta].set_index("planner")
+            shown = [_count(counts.loc[planner]) for planner in ("nominal", "cohesive")]
+            cells.append(" / ".join(shown))
+        rows.append([str(case), str(claim), *cells])
+    touched = []
+    for theta in thetas:
+        found = claims[(claims["claim"] == CONTACT) & (claims["theta"] == theta)]
+        sums = found.groupby("planner")["count"].sum()
+        touched.append(f"{sums['nominal']} / {sums['cohesive']}")
+    rows.append(["all", CONTACT, *touched])
+    head = f"claim, nominal / cohesive of {n}"
+    return _rows(["case", head, *heads], rows)
+
+
+def _count(row: pd.Series) -> str:
+    missed = isinstance(row["target"], str) and row["target"] and str(row["met"]) != "True"
+    return f"**{row['count']}**" if missed else str(row["count"])
+
+
+def held_out_table(fit: pd.DataFrame) -> str:
+    """One row per theta and model: log-likelihood and displacements on runs held out."""
+    rows = []
+    for r in fit.itertuples():
+        numbers = (r.log_likelihood, r.off_1s, r.off_2s, r.off_3s)
+        cells = ["-" if pd.isna(n) else f"{n:.3g}" for n in numbers]
+        rows.append([str(r.theta), str(r.model), *cells, str(r.windows)])
+    heads = ["driving", "model", "nats per s", "m off, 1 s", "2 s", "3 s", "windows"]
+    return _rows(heads, rows)
+
+
 def pages() -> dict[Path, dict[str, str]]:
     """Tables of each page, by name."""
     solvers = pd.read_csv(BENCHMARKS / "planner.csv")
+    learned = {
+        name: pd.read_csv(HERE / f"learn_{name}.csv")
+        for name in ("recovery", "coverage", "speed", "weights", "claims", "fit")
+    }
     return {
         EVIDENCE: {
             "claims": claims_table(pd.read_csv(HERE / "claims.csv")),
@@ -115,6 +217,13 @@ def pages() -> dict[Path, dict[str, str]]:
             "horizon": horizon_table(pd.read_csv(HERE / "horizon.csv")),
             "solvers 10": solvers_table(solvers, 10),
             "solvers 40": solvers_table(solvers, 40),
+        },
+        LEARNING: {
+            "learn:recovery": recovery_table(learned["recovery"], learned["coverage"]),
+            "learn:speed": speed_table(learned["speed"]),
+            "learn:weights": learned_weights_table(learned["weights"]),
+            "learn:closed loop": learned_claims_table(learned["claims"]),
+            "learn:held-out": held_out_table(learned["fit"]),
         },
     }
 
