@@ -137,6 +137,17 @@ retries = 0
 """
 
 
+_THETA = """[planner.reward]
+lane = 1.0
+speed = 0.012
+car = 2.3
+curvature = 1.1e6
+
+[cohesion]
+beta = 0.36
+"""
+
+
 @dataclass(frozen=True)
 class Base:
     """Sound files by name, those that may be damaged, and commands to read them with.
@@ -154,7 +165,8 @@ class Base:
 def make_bases(folder: Path) -> list[Base]:
     """Collect the bundled scenarios and make the rest, in a folder for what is made."""
     bases = [_bundled(path) for path in sorted((ROOT / "scenarios").glob("*.toml"))]
-    return [*bases, _curve(), _grid(folder), _experiment(), *_saved(folder)]
+    saved = _saved(folder)
+    return [*bases, _curve(), _grid(folder), _experiment(), *saved, _weights(), _driving(folder)]
 
 
 def _run(scenario: str, *more: str) -> tuple[tuple[str, ...], ...]:
@@ -250,4 +262,48 @@ def _kept(folder: Path, figure: tuple[str, ...], weight: float) -> Base:
     }
     damaged = tuple(n for n in files if not n.endswith(".png"))
     commands = (("metrics", folder.name), ("figure", folder.name, *figure))
-    return Base(folder.name, files, damaged, commands, weight)
+    learned = [(*_learn(folder.name), "--from", kind) for kind in ("plans", "driven", "humans")]
+    return Base(folder.name, files, damaged, (*commands, *learned), weight)
+
+
+def _learn(*demos: str) -> tuple[str, ...]:
+    return ("learn", *demos, "--bootstrap", "0", "--hold-out", "0", "--out", "theta.toml")
+
+
+def _weights() -> Base:
+    """Weights that were learned, and a run with them."""
+    values = ("--set", "planner.reward=@theta.toml", "--set", "cohesion.beta=@theta.toml")
+    run_with = ("run", "stalled", "--planner", "nominal", "--set", "duration=1.0", *values)
+    files = {"theta.toml": _THETA.encode()}
+    return Base("weights", files, tuple(files), (run_with,))
+
+
+def _driving(folder: Path) -> Base:
+    """Driving to learn from: SUMO's own output on the streets, and the same as a table."""
+    demand, output = folder / "grid.rou.xml", folder / "fcd.xml"
+    demand.write_text(_GRID_DEMAND, encoding="utf-8")
+    program = shutil.which("sumo", path=str(Path(sys.executable).parent)) or "sumo"
+    files = ["-n", str(folder / "grid.net.xml"), "-r", str(demand), "--fcd-output", str(output)]
+    options = ["--step-length", "0.1", "--end", "8", "--precision", "6", "--seed", "1"]
+    subprocess.run([program, *files, *options], check=True, capture_output=True)
+    rows = ["time,vehicle,x,y"]
+    time = ""
+    for line in output.read_text(encoding="utf-8").splitlines():
+        step = re.search(r'<timestep time="([^"]*)"', line)
+        time = step[1] if step else time
+        car = re.search(r'<vehicle id="([^"]*)" x="([^"]*)" y="([^"]*)"', line)
+        if car:
+            rows.append(",".join((time, *car.groups())))
+    network = "grid.net.xml"
+    contents = {
+        "fcd.xml": output.read_bytes(),
+        "table.csv": "\n".join(rows).encode(),
+        network: (folder / network).read_bytes(),
+        "grid.rou.xml": demand.read_bytes(),
+    }
+    commands = (
+        (*_learn("fcd.xml"), "--network", network),
+        (*_learn("fcd.xml"), "--network", network, "--demand", "grid.rou.xml"),
+        (*_learn("table.csv"), "--network", network),
+    )
+    return Base("driving", contents, tuple(contents), commands, 2.0)

@@ -72,7 +72,7 @@ def bounded(command: tuple[str, ...], files: dict[str, bytes]) -> tuple[str, ...
 
     A run may last a day and depart after a week: what is tried here is its input, not that.
     """
-    if command[0] != "run":
+    if command[0] != "run" or command[1] not in files:
         return command
     text = files[command[1]].decode(errors="replace")
     more = []
@@ -96,6 +96,8 @@ def warm_up() -> None:
         "sumo_cohesion.batches.comparison",
         "sumo_cohesion.batches.results",
         "sumo_cohesion.batches.single",
+        "sumo_cohesion.demonstrations.learn",
+        "sumo_cohesion.demonstrations.reading",
         "sumo_cohesion.report.grid",
         "sumo_cohesion.report.paths",
         "matplotlib.pyplot",

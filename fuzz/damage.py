@@ -32,9 +32,13 @@ def damage(name: str, data: bytes, rng: random.Random) -> tuple[bytes, str]:
     """Damage a file by its kind; return its new content and what was done."""
     kind = name.rpartition(".")[2]
     ways: list[Callable[[bytes, random.Random], tuple[bytes, str]]] = [_bytes]
-    ways += {"xml": [_xml] * 9, "toml": [_toml] * 6, "json": [_json] * 4, "parquet": [_table] * 4}[
-        kind
-    ]
+    ways += {
+        "xml": [_xml] * 9,
+        "toml": [_toml] * 6,
+        "json": [_json] * 4,
+        "parquet": [_table] * 4,
+        "csv": [],
+    }[kind]
     new, what = rng.choice(ways)(data, rng)
     return new, f"{name}: {what}"
 
