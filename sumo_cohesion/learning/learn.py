@@ -79,7 +79,12 @@ class Material:
     def fit(self, options: Options, held: Mapping[str, float] | None = None) -> Fit:
         """Fit the weights."""
         fixed = options.fixed if held is None else held
-        return fit(self.data, self.names, self.defaults, fixed, options.keep)
+        try:
+            return fit(self.data, self.names, self.defaults, fixed, options.keep)
+        except np.linalg.LinAlgError:
+            raise UserError(
+                "--fix: with these weights some controls cost nothing; keep fewer at zero"
+            ) from None
 
 
 def learn_from(
@@ -98,18 +103,19 @@ def learn_from(
         If nothing can be learned from the sources; the message says why.
     """
     say = progress or _silent
+    for name in options.fixed:
+        if name not in settings.reward.in_use:
+            known = ", ".join(settings.reward.in_use)
+            raise UserError(f"--fix: there is no term {name!r} in use; terms are {known}")
     settings = settings.model_copy(update={"horizon": how.steps, "reward": settings.reward.shape})
     segments, material = _material(_examples(sources, how, say), settings, say)
-    for name in options.fixed:
-        if name not in material.names:
-            known = ", ".join(material.names)
-            raise UserError(f"--fix: there is no term {name!r} in use; terms are {known}")
     found, interval = _doubted(material, options, say)
     table, predictions = _tried(sources, how, settings, material, found, options, say)
     rows = _segment_table(segments, found)
     runs = len(set(material.segments.run))
     return Learned(
         reward=_reward(found),
+        anchor=found.anchor,
         temperature=1.0 / found.scale,
         weights=_weight_table(found, material.defaults, interval),
         segments=rows,
@@ -180,13 +186,10 @@ def _doubted(
         found = replace(found, kept_default={**found.kept_default, **why})
         if options.draws == 0 or len(set(material.segments.run)) < 2:
             return found, None
-        fixed = {n: float(found.weights[found.names.index(n)]) for n in found.kept_default}
         samples = bootstrap(
             material.data,
             material.segments.run,
             found,
-            fixed,
-            material.defaults,
             options.draws,
             lambda done, total: say("drawing runs", done, total),
         )
@@ -217,9 +220,8 @@ def _tried(
     train = ~np.isin(material.segments.run, list(out))
     if not out or not train.any() or train.all():
         return pd.DataFrame(columns=_FIT_COLUMNS), pd.DataFrame(columns=_PREDICTION_COLUMNS)
-    fixed = {n: float(found.weights[found.names.index(n)]) for n in found.kept_default}
     seen = material.where(train)
-    trained = seen.fit(options, fixed)
+    trained = seen.fit(options, found.weights_of([*found.kept_default, found.anchor]))
     default = material.defaults * best_scale(seen.data, material.defaults, options.keep)
     told = likelihoods(
         material.data,

@@ -6,12 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
-import pandas as pd
+from numpy.typing import NDArray
 
 from sumo_cohesion.learning.example import Example
 from sumo_cohesion.learning.motion import controls
 from sumo_cohesion.planning.problem import Problem
 from sumo_cohesion.planning.settings import PlannerSettings
+from sumo_cohesion.planning.solvers.compiled import BUILDING
 from sumo_cohesion.planning.solvers.transcription import Transcription
 from sumo_cohesion.planning.stage import CONTROL_SCALE, UNLIMITED, StageParameters
 from sumo_cohesion.road import RoadAhead
@@ -39,8 +40,8 @@ class Segments:
     dropped : (N,) why a segment cannot be an optimum of the planner's problem; "" if it can.
     """
 
-    run: FloatArray
-    vehicle: FloatArray
+    run: NDArray[np.object_]
+    vehicle: NDArray[np.object_]
     time: FloatArray
     start: FloatArray
     stages: FloatArray
@@ -49,12 +50,12 @@ class Segments:
     low: FloatArray
     high: FloatArray
     change: FloatArray
-    dropped: FloatArray
+    dropped: NDArray[np.object_]
 
     def __len__(self) -> int:
         return len(self.run)
 
-    def where(self, chosen: BoolArray) -> Segments:
+    def where(self, chosen: BoolArray | slice) -> Segments:
         """Return some of them."""
         return Segments(**{f.name: getattr(self, f.name)[chosen] for f in fields(self)})
 
@@ -72,8 +73,9 @@ def make_segments(examples: Sequence[Example], settings: PlannerSettings) -> Seg
     for every term in use.
     """
     n_lanes = max((e.road.lane_centre.shape[1] for e in examples), default=1)
-    layout, writer = StageParameters(settings, n_lanes), Transcription(settings, n_lanes)
-    bends, limit = layout.columns("road_curvature"), layout.columns("speed_limit")
+    with BUILDING:
+        layout, writer = StageParameters(settings, n_lanes), Transcription(settings, n_lanes)
+    bends = layout.columns("road_curvature")
     n, steps = len(examples), settings.horizon
     start, stages = np.zeros((n, 6)), np.zeros((n, steps, layout.size))
     low, high, change = (np.zeros((n, steps, 2)) for _ in range(3))
@@ -89,8 +91,6 @@ def make_segments(examples: Sequence[Example], settings: PlannerSettings) -> Seg
         start[i], stages[i] = instance.start, instance.stages
         low[i], high[i], change[i] = instance.low, instance.high, instance.change
         states[i, 0], states[i, 1:] = example.ego, example.states
-        if example.desired_speed is not None:
-            stages[i, :, limit] = example.desired_speed
         if not example.bounded:
             low[i], high[i], change[i] = -UNLIMITED, UNLIMITED, UNLIMITED
             # The control before is what it was, not what the planner's bounds would have left.
@@ -116,13 +116,21 @@ def make_segments(examples: Sequence[Example], settings: PlannerSettings) -> Seg
 
 
 def problem_of(example: Example, settings: PlannerSettings, n_lanes: int) -> Problem:
-    """Return the problem that the nominal planner would have had."""
+    """Return the problem that the nominal planner would have had.
+
+    The speed that the driver would like to drive is to it what the limit is to a planner.
+    """
     steps, ego = settings.horizon, example.ego
     nothing, nowhere = (0.0,) * len(FEATURES), np.zeros(steps)
+    road = _with_lanes(example.road.ahead(ego.s, ego.d, STEP * ego.speed, steps + 1), n_lanes)
+    if example.desired_speed is not None:
+        rows = road.rows.copy()
+        rows[:, -2] = example.desired_speed
+        road = road._replace(rows=rows)
     return Problem(
         ego=ego,
         ego_size=example.ego_size,
-        road=_with_lanes(example.road.ahead(ego.s, ego.d, STEP * ego.speed, steps + 1), n_lanes),
+        road=road,
         cars=example.cars[: settings.cars],
         cohesion_weight=nothing,
         cohesion_target=nothing,
@@ -172,9 +180,3 @@ def free_directions(segments: Segments) -> tuple[FloatArray, BoolArray]:
         basis[i] = np.concatenate((directions[rank:], directions[:rank])).T
         free[i, size - rank :] = False
     return basis, free
-
-
-def table(segments: Segments, columns: dict[str, FloatArray]) -> pd.DataFrame:
-    """One row per segment, with more columns."""
-    named = {"run": segments.run, "vehicle": segments.vehicle, "time": segments.time}
-    return pd.DataFrame({**named, **columns}).astype({"run": "string", "vehicle": "string"})

@@ -147,11 +147,15 @@ class _Around:
         self._places = table[["x", "y"]].to_numpy(float)
         self._sizes = table[["length", "width"]].to_numpy(float)
         self._velocities = self._differences()
-        tick = np.rint(self._times / self._interval).astype(int)
+        tick = self._tick(self._times)
         order = np.argsort(tick, kind="stable")
         values, starts = np.unique(tick[order], return_index=True)
         rows = np.split(order, starts[1:])
         self._at = dict(zip(values.tolist(), rows, strict=True))
+
+    def _tick(self, times: FloatArray) -> IntArray:
+        """Return which interval times are in: half-way between two always the later one."""
+        return np.asarray(np.floor(times / self._interval + 0.5), dtype=np.intp)
 
     def _differences(self) -> FloatArray:
         """Velocity (m/s) of every row: half-way to both neighbours of the same vehicle."""
@@ -170,7 +174,7 @@ class _Around:
         self, vehicle: str, time: float, ego: RoadState, road: Road, sensing_range: float
     ) -> FloatArray:
         """Return the others at a time in a road's frame, nearest first, as planners see them."""
-        rows = self._at.get(round(time / self._interval), np.empty(0, int))
+        rows = self._at.get(int(self._tick(np.array(time))), np.empty(0, int))
         rows = rows[self._names[rows] != vehicle]
         velocity = self._velocities[rows]
         late = (time - self._times[rows])[:, None]
