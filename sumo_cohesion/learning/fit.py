@@ -231,11 +231,10 @@ def maximise(
 def _errors(curvature: FloatArray) -> FloatArray:
     """Square roots of the diagonal of a curvature's inverse; inf where it is not positive."""
     values, vectors = np.linalg.eigh(0.5 * (curvature + curvature.T))
-    with np.errstate(divide="ignore"):
-        inverse = np.where(values > 0.0, 1.0 / np.maximum(values, 1e-300), np.inf)
-    share = vectors**2
-    variance = np.where(share > 1e-12, share * inverse, 0.0).sum(axis=1)
-    return np.asarray(np.sqrt(variance))
+    known, share = values > 0.0, vectors**2
+    variance = share[:, known] @ (1.0 / values[known])
+    unknown = (share[:, ~known] > 1e-12).any(axis=1)
+    return np.where(unknown, np.inf, np.sqrt(variance))
 
 
 def bootstrap(
