@@ -160,6 +160,7 @@ def _material(
     """Return all segments, each with why it is dropped, and what is made of the others."""
     say("weighing", 0, 1)
     segments = make_segments(examples, settings)
+    _require_some(segments)
     usable = segments.dropped == ""
     data = quadratics(segments.where(usable), settings)
     penalty = np.zeros(len(segments))
@@ -167,13 +168,17 @@ def _material(
     # An active penalty has a kink: no gradient is zero there.
     segments = segments.drop(penalty > 0.0, "too near to a car, or off the road")
     say("weighing", 1, 1)
-    if not (segments.dropped == "").any():
-        reasons = "; ".join(f"{reason}: {count}" for reason, count in _counted(segments).items())
-        raise UserError(f"nothing can be learned from {len(segments)} segments ({reasons})")
+    _require_some(segments)
     names = settings.reward.in_use
     defaults = np.array([getattr(RewardWeights(), name) for name in names])
     chosen = segments.where(segments.dropped == "")
     return segments, Material(chosen, data.where(data.penalty <= 0.0), names, defaults)
+
+
+def _require_some(segments: Segments) -> None:
+    if not (segments.dropped == "").any():
+        reasons = "; ".join(f"{reason}: {count}" for reason, count in _counted(segments).items())
+        raise UserError(f"nothing can be learned from {len(segments)} segments ({reasons})")
 
 
 def _doubted(

@@ -67,12 +67,12 @@ class Score(NamedTuple):
 
 
 def quadratics(segments: Segments, settings: PlannerSettings) -> Quadratics:
-    """Work out gradient and curvature of every reward term in use, around every segment."""
+    """Work out gradient and curvature of every reward term in use, around one segment or more."""
     functions = _stage_functions(settings, _lanes_of(segments, settings))
     at_once = max(_STAGES_AT_ONCE // settings.horizon, 1)
     parts = [
         _quadratics(segments.where(slice(first, first + at_once)), *functions)
-        for first in range(0, max(len(segments), 1), at_once)
+        for first in range(0, len(segments), at_once)
     ]
     return Quadratics(*[np.concatenate(part) for part in zip(*parts, strict=True)])
 
@@ -144,8 +144,6 @@ def _stage_functions(settings: PlannerSettings, n_lanes: int) -> tuple[Any, Any]
 def _mapped(function: Any, columns: list[FloatArray]) -> list[FloatArray]:
     """Call a function for every column; (columns, entries) of each of its outputs."""
     n = columns[0].shape[1]
-    if n == 0:
-        return [np.empty((0, function.numel_out(i))) for i in range(function.n_out())]
     with BUILDING:
         mapped = function.map(n)
     # Blocks of columns, each column-major: its transpose is row-major.
