@@ -181,7 +181,7 @@ def coverage(kind: str, segments: Segments, data: Quadratics) -> pd.DataFrame:
         mine = (first <= seed) & (seed < first + share)
         own = data.where(mine)
         found = fit(own, NAMES, TRUTH, {}, 0.85)
-        samples = bootstrap(own, segments.run[mine], found, {}, DRAWS)
+        samples = bootstrap(own, segments.run[mine], found, DRAWS)
         low, high = np.quantile(samples, INTERVAL, axis=0)
         low, high = rounded(low, np.floor), rounded(high, np.ceil)
         for i, name in enumerate(NAMES):

@@ -13,8 +13,10 @@ import pandas as pd
 from sumo_cohesion.batches.experiment import stored_points
 from sumo_cohesion.batches.results import run_folders
 from sumo_cohesion.batches.store import (
+    DONE,
     as_cell,
     is_batch,
+    joined,
     manifest,
     read_parquet,
     table_file,
@@ -35,6 +37,19 @@ from sumo_cohesion.user_input import validated
 
 _SAME_PLACE = 0.01
 """Metres within which a place must be where the run recorded it, if the network is the same."""
+_STATE = ("time", "s", "d", "road_heading", "speed")
+_FINITE = {
+    "trajectory": (*_STATE, "x", "y", "heading", "length", "width"),
+    "plan": ("time",),
+    "horizon": _STATE,
+}
+"""Columns of a table that are numbers in every row."""
+_ALSO = {
+    "trajectory": ("vehicle", "visible", "planned"),
+    "plan": ("curvature", "acceleration", "fallback", "intervened"),
+    "horizon": (),
+}
+"""Other columns that are read."""
 
 
 @dataclass(frozen=True)
@@ -42,9 +57,11 @@ class Run:
     """One run's tables; they are read when they are asked for.
 
     ``special`` vehicles do not drive as humans do: those that the scenario hides or calls special.
+    ``place`` is where its tables are, which no other run's are.
     """
 
     name: str
+    place: Path
     road: Road
     settings: PlannerSettings
     planner: str
@@ -55,9 +72,25 @@ class Run:
         """Return the driving that is asked for."""
         return PlansOf(self) if kind == "plans" else TracksOf(self, kind)
 
+    def read(self, name: str) -> pd.DataFrame:
+        """Return one of the run's tables, if it is sound."""
+        table = self.table(name)
+        missing = [c for c in (*_FINITE[name], *_ALSO[name]) if c not in table]
+        if missing:
+            raise UserError(f"{self.name}: its table {name} has no {missing[0]!r}; run it again")
+        for column in _FINITE[name]:
+            numbers = pd.to_numeric(table[column], errors="coerce").to_numpy(float)
+            if not np.isfinite(numbers).all():
+                row = int(np.isfinite(numbers).argmin()) + 1
+                raise UserError(
+                    f"{self.name}: its table {name} is damaged ({column} in row {row} is no "
+                    "number); run it again"
+                )
+        return table
+
     def trajectory(self) -> pd.DataFrame:
         """Return the run's trajectories, if they are those of this road."""
-        table = self.table("trajectory")
+        table = self.read("trajectory")
         some = table.iloc[:: max(len(table) // 50, 1)]
         frenet, _ = self.road.to_frenet(some[["x", "y", "heading", "speed"]].to_numpy(float))
         off = np.abs(frenet[:, :2] - some[["s", "d"]].to_numpy(float)).max(initial=0.0)
@@ -83,8 +116,8 @@ class PlansOf:
     def examples(self, how: Cutting) -> Sequence[Example]:
         """Take every plan that is half its own length after the one before."""
         run, steps = self.run, self.run.settings.horizon
-        tables = run.table("plan"), run.table("horizon")
-        if not len(tables[1]):
+        plan, horizon = run.read("plan"), run.read("horizon")
+        if not len(horizon):
             raise UserError(
                 f"{run.name}: planner {run.planner} left no plans, only controls; learn from what "
                 "it drove: --from driven"
@@ -94,7 +127,10 @@ class PlansOf:
                 f"{run.name}: its plans are {steps} steps long; plans cannot be cut to "
                 f"--steps {how.steps}, learn from what was driven: --from driven"
             )
-        return plans(run.name, run.road, run.trajectory(), *tables, max(steps // 2, 1))
+        trajectory = run.trajectory()
+        if not plan["time"].isin(trajectory.loc[trajectory["vehicle"] == EGO, "time"]).all():
+            raise UserError(f"{run.name}: its tables are of different runs; run it again")
+        return plans(run.name, run.road, trajectory, plan, horizon, steps)
 
 
 @dataclass(frozen=True)
@@ -113,7 +149,7 @@ class TracksOf:
         """Cut the vehicles' tracks."""
         trajectory = self.run.trajectory()
         if self.kind == "driven":
-            vehicles = {EGO}
+            vehicles, trajectory = {EGO}, trajectory[trajectory["visible"]]
         else:
             planned = set(trajectory.loc[trajectory["planned"], "vehicle"])
             vehicles = set(trajectory["vehicle"]) - planned - self.run.special
@@ -152,7 +188,9 @@ def _of_folder(path: Path, root: Path) -> Run:
             f"{path}: not a run that can be learned from ({type(error).__name__}: {error}); run "
             f"it again"
         ) from None
-    return Run(name, road, settings, planner, special, lambda t: _parquet(path / f"{t}.parquet"))
+    return Run(
+        name, path, road, settings, planner, special, lambda t: _parquet(path / f"{t}.parquet")
+    )
 
 
 def _parquet(path: Path) -> pd.DataFrame:
@@ -166,20 +204,30 @@ def _of_batch(folder: Path) -> list[Run]:
     if not {"folder", "files"} <= set(about):
         raise UserError(f"{folder}: does not say where its scenarios are; run the batch again")
     points, seeds = stored_points(about)
-    found = []
-    for point in points:
+    results = joined(folder)
+    done = set(results.loc[results["status"] == DONE, "run"])
+    found: dict[str, Run] = {}
+    # The plan lists every point's seeds, point by point; points that come to the same share runs.
+    for i, point in enumerate(points):
         setup = prepare(point.request(seeds[0]))
-        rows = plan[(plan["scenario"] == setup.scenario.name) & (plan["planner"] == point.planner)]
-        for key, value in point.grid.items():
-            rows = rows[rows[key].astype(str) == str(as_cell(value))]
+        rows = plan.iloc[i * len(seeds) : (i + 1) * len(seeds)]
         for run, seed in zip(rows["run"], rows["seed"], strict=True):
-            name = f"{folder.name}/{setup.scenario.name}/{point.planner}/{seed}"
-            special = frozenset(setup.not_human)
-            tables = _kept(folder, run)
-            found.append(Run(name, setup.road, setup.settings, point.planner, special, tables))
+            if run in found or run not in done:
+                continue
+            cells = [f"{key}={as_cell(value)}" for key, value in point.grid.items()]
+            parts = [folder.name, setup.scenario.name, point.planner, *cells, str(seed)]
+            found[run] = Run(
+                "/".join(parts),
+                folder / run,
+                setup.road,
+                setup.settings,
+                point.planner,
+                frozenset(setup.not_human),
+                _kept(folder, run),
+            )
     if not found:
-        raise UserError(f"{folder}: the batch has no runs; run it first")
-    return found
+        raise UserError(f"{folder}: no run of the batch was done; run it first")
+    return list(found.values())
 
 
 def _kept(folder: Path, run: str) -> Callable[[str], pd.DataFrame]:

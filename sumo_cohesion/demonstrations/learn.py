@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from math import inf
 from pathlib import Path
 from typing import Any, get_args
 
@@ -16,7 +19,7 @@ from sumo_cohesion.learning.tracks import Cutting
 from sumo_cohesion.planning.reward import RewardWeights
 from sumo_cohesion.planning.settings import PlannerSettings
 from sumo_cohesion.simulation.overrides import settings_from
-from sumo_cohesion.user_input import closest
+from sumo_cohesion.user_input import closest, validated
 
 KINDS = get_args(Kind)
 _DID = {"plans": "planned", "driven": "drove", "humans": ""}
@@ -24,6 +27,7 @@ KEEP = {"plans": 0.85, "driven": 0.85, "humans": 0.95}
 """Share of the segments that the fit is made of, unless told otherwise."""
 SMOOTH = {"plans": (0.0, 0.0), "driven": (0.0, 0.0), "humans": (1.0, 2.0)}
 """Seconds along and across the road, unless told otherwise: planners drive without noise."""
+_REWARD = "planner.reward"
 _OF_THE_SOLVER = {"reward", "solver", "max_iterations", "last_resort", "constraint"}
 """Settings that runs which are learned from together may differ in."""
 
@@ -76,43 +80,69 @@ def learn(
     UserError
         If a source is wrong or holds nothing to learn from.
     """
-    _check(source, steps, smooth, desired, keep, hold_out, draws)
-    settings, _, of_scenario = settings_from(overrides or {})
-    for name in of_scenario:
-        raise UserError(f"{name} is a scenario's: learn takes planner.* settings only")
-    paths = [Path(p) for p in ([demos] if isinstance(demos, str | Path) else demos)]
-    if not paths:
-        raise UserError("nothing to learn from: give folders of runs, or files of driving")
-    runs = [run for path in paths if path.is_dir() for run in runs_in(path)]
-    if runs:
-        settings = _common_settings(runs, overrides or {})
-    if runs and source != "humans" and not all(path.is_dir() for path in paths):
+    _check(source, steps, smooth, desired, fix or {}, keep, hold_out, draws)
+    _check_overrides(overrides or {})
+    paths = _paths(demos)
+    runs = _distinct([run for path in paths if path.is_dir() for run in runs_in(path)])
+    files = [path for path in paths if not path.is_dir()]
+    if files and (source == "driven" or (runs and source == "plans")):
         raise UserError(f"files hold humans, not what a planner {_DID[source]}: --from humans")
-    files = _recordings([path for path in paths if not path.is_dir()], network, demand)
-    sources = [*[run.source(source) for run in runs], *map(Tracks, files)]
-    settings = settings.model_copy(update={"reward": _reward(also)})
-    length = steps or (settings.horizon if source == "plans" and runs else 10)
+    kind: Kind = source if runs else "humans"
+    recordings = _recordings(files, network, demand)
+    sources = [*[run.source(kind) for run in runs], *map(Tracks, recordings)]
+    settings = _with_terms(also, _common_settings(runs, overrides or {}))
     how = Cutting(
-        steps=length,
-        smooth=smooth or SMOOTH[source if runs else "humans"],
+        steps=steps or (settings.horizon if kind == "plans" else 10),
+        smooth=SMOOTH[kind] if smooth is None else smooth,
         own_speed=desired == "own",
         friction=settings.friction,
-        by_vehicle=source == "humans" or not runs,
-        bounded=source == "driven",
+        by_vehicle=kind == "humans",
+        bounded=kind == "driven",
     )
-    exact = source == "plans" and not files
-    shown = source if runs else "humans"
     options = Options(
-        KEEP[shown] if keep is None else keep, dict(fix or {}), hold_out, draws, exact
+        keep=KEEP[kind] if keep is None else keep,
+        fixed=dict(fix or {}),
+        hold_out=hold_out,
+        draws=draws,
+        exact=kind == "plans",
     )
     about = {
         "demonstrations": [str(path) for path in paths],
-        "source": shown,
+        "source": kind,
         "smooth": list(how.smooth),
         "desired": desired,
-        "notes": [note for recording in files for note in recording.notes],
+        "notes": [note for recording in recordings for note in recording.notes],
     }
     return learn_from(sources, how, settings, options, about, progress)
+
+
+def _paths(demos: str | Path | Sequence[str | Path]) -> list[Path]:
+    """Return what is to be learned from: there, and nothing twice."""
+    paths = [Path(p) for p in ([demos] if isinstance(demos, str | Path) else demos)]
+    if not paths:
+        raise UserError("nothing to learn from: give folders of runs, or files of driving")
+    for i, path in enumerate(paths):
+        if not path.exists():
+            raise UserError(f"{path}: there is no such file or folder to learn from")
+        if path.resolve() in [earlier.resolve() for earlier in paths[:i]]:
+            raise UserError(f"{path}: is given twice, and would count twice; give it once")
+    return paths
+
+
+def _distinct(runs: Sequence[Run]) -> list[Run]:
+    """Refuse what would count twice; tell runs of the same name apart."""
+    seen: set[Path] = set()
+    named: Counter[str] = Counter()
+    found = []
+    for run in runs:
+        place = run.place.resolve()
+        if place in seen:
+            raise UserError(f"{run.place}: is in two of the folders, and would count twice")
+        seen.add(place)
+        named[run.name] += 1
+        count = named[run.name]
+        found.append(run if count == 1 else replace(run, name=f"{run.name} ({count})"))
+    return found
 
 
 def _recordings(
@@ -123,12 +153,7 @@ def _recordings(
     from sumo_cohesion.traffic.network import Network
 
     on = Network(Path(network)) if network is not None and paths else None
-    found = []
-    for path in paths:
-        if not path.exists():
-            raise UserError(f"{path}: there is no such file or folder to learn from")
-        found.append(read(path, on, [Path(file) for file in demand]))
-    return found
+    return [read(path, on, [Path(file) for file in demand]) for path in paths]
 
 
 def _check(
@@ -136,6 +161,7 @@ def _check(
     steps: int | None,
     smooth: tuple[float, float] | None,
     desired: str,
+    fix: Mapping[str, float],
     keep: float | None,
     hold_out: float,
     draws: int,
@@ -149,6 +175,9 @@ def _check(
         raise UserError(f"steps {steps}: a segment has 2 to 100 steps of 0.1 s")
     if smooth is not None and not (len(smooth) == 2 and all(0.0 <= s <= 60.0 for s in smooth)):
         raise UserError("smooth: give two times in seconds, along and across the road, e.g. 1,2")
+    for name, weight in fix.items():
+        if not 0.0 <= weight < inf:
+            raise UserError(f"fix {name}={weight:g}: a weight is a number, zero or more")
     if keep is not None and not 0.1 <= keep <= 1.0:
         raise UserError(f"keep {keep:g}: a share of 0.1 to 1")
     if not 0.0 <= hold_out <= 0.9:
@@ -157,17 +186,30 @@ def _check(
         raise UserError(f"draws {draws}: 0 to 100000")
 
 
-def _reward(also: Sequence[str]) -> RewardWeights:
-    """Return weights that have the terms in use that are to be learned."""
+def _check_overrides(overrides: Mapping[str, Any]) -> None:
+    """Raise UserError unless all are settings of the planner that learning leaves as they are."""
+    settings_from(overrides)
+    for name in overrides:
+        if name.startswith(_REWARD):
+            raise UserError(f"{name}: weights are learned here; keep one by --fix edge=500")
+        if not name.startswith("planner."):
+            raise UserError(f"{name} is not the planner's: learn takes planner.* settings only")
+
+
+def _with_terms(also: Sequence[str], settings: PlannerSettings) -> PlannerSettings:
+    """Return settings with those terms in use that are to be learned."""
     usual, known = RewardWeights().in_use, list(RewardWeights.model_fields)
     for name in also:
         if name not in known:
             raise UserError(f"also: there is no reward term {name!r}{closest(name, known)}")
-    return RewardWeights(**{name: 1.0 for name in known if name in usual or name in also})
+    terms = {name: 1.0 for name in known if name in usual or name in also}
+    return validated(PlannerSettings, settings.model_dump() | {"reward": terms}, "planner settings")
 
 
 def _common_settings(runs: Sequence[Run], overrides: Mapping[str, Any]) -> PlannerSettings:
     """Return the settings that all runs were made with; the overrides come on top."""
+    if not runs:
+        return settings_from(overrides)[0]
     first, *others = runs
     plain = first.settings.model_dump()
     for other in others:

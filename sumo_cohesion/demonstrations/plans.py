@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Hashable, Mapping
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -22,9 +23,9 @@ def plans(
     trajectory: pd.DataFrame,
     plan: pd.DataFrame,
     horizon: pd.DataFrame,
-    every: int,
+    steps: int,
 ) -> list[Example]:
-    """Return every n-th plan of a run's planner: each the optimum of its own problem."""
+    """Return every plan of so many steps that is half its own length after the one before."""
     egos = trajectory[trajectory["vehicle"] == EGO]
     size = float(egos["length"].iloc[0]), float(egos["width"].iloc[0])
     states, ahead = _by_time(egos, _STATE), _by_time(horizon, _STATE)
@@ -32,7 +33,7 @@ def plans(
     found, driven = [], None
     for i, row in enumerate(plan.to_dict(orient="records")):
         time = row["time"]
-        if i % every == 0:
+        if i % max(steps // 2, 1) == 0:
             ego, planned = RoadState(*states[time][0].tolist()), ahead.get(time, _NO_STATES)
             found.append(
                 Example(
@@ -46,7 +47,7 @@ def plans(
                     driven=driven,
                     states=planned,
                     bounded=True,
-                    unusable=_unusable(row, planned),
+                    unusable=_unusable(row, len(planned), steps),
                 )
             )
         control = Control(row["curvature"], row["acceleration"])
@@ -54,12 +55,15 @@ def plans(
     return found
 
 
-def _unusable(row: Mapping[Hashable, object], planned: FloatArray) -> str:
-    if not len(planned):
+def _unusable(row: Mapping[Hashable, Any], planned: int, steps: int) -> str:
+    """Say why a plan demonstrates nothing; planners of others need not tell their cohesion."""
+    if not planned:
         return "no plan"
     if row["fallback"] or row["intervened"]:
         return "not the planner's own optimum"
-    if row["reward_cohesion"] != 0.0:
+    if planned != steps:
+        return "a plan of another length"
+    if abs(row.get("reward_cohesion", 0.0)) > 0.0:
         return "cohesion had a part in it"
     return ""
 

@@ -82,7 +82,12 @@ class Material:
 
     def fit(self, options: Options) -> Fit:
         """Fit the weights."""
-        return fit(self.data, self.names, self.defaults, options.fixed, options.keep)
+        try:
+            return fit(self.data, self.names, self.defaults, options.fixed, options.keep)
+        except np.linalg.LinAlgError:
+            raise UserError(
+                "--fix: with these weights some controls cost nothing; keep fewer at zero"
+            ) from None
 
 
 def learn_from(
@@ -101,18 +106,19 @@ def learn_from(
         If nothing can be learned from the sources; the message says why.
     """
     say = progress or _silent
+    for name in options.fixed:
+        if name not in settings.reward.in_use:
+            known = ", ".join(settings.reward.in_use)
+            raise UserError(f"--fix: there is no term {name!r} in use; terms are {known}")
     settings = settings.model_copy(update={"horizon": how.steps, "reward": settings.reward.shape})
     segments, material = _material(_examples(sources, how, say), settings, say)
-    for name in options.fixed:
-        if name not in material.names:
-            known = ", ".join(material.names)
-            raise UserError(f"--fix: there is no term {name!r} in use; terms are {known}")
     found, interval = _doubted(material, options, say)
     table, predictions = _tried(sources, how, settings, material, found, options, say)
     rows = _segment_table(segments, found, material.data.free)
     runs = len(set(material.segments.run))
     return Learned(
         reward=_reward(found.names, found.weights),
+        anchor=found.anchor,
         temperature=1.0 / found.scale,
         weights=_weight_table(found, material.defaults, interval),
         segments=rows,
@@ -157,6 +163,7 @@ def _material(
     """Return all segments, each with why it is dropped, and what is made of the others."""
     say("weighing", 0, 1)
     segments = make_segments(examples, settings)
+    _require_some(segments)
     usable = segments.dropped == ""
     data = quadratics(segments.where(usable), settings)
     penalty = np.zeros(len(segments))
@@ -164,13 +171,17 @@ def _material(
     # An active penalty has a kink: no gradient is zero there.
     segments = segments.drop(penalty > 0.0, "too near to a car, or off the road")
     say("weighing", 1, 1)
-    if not (segments.dropped == "").any():
-        reasons = "; ".join(f"{reason}: {count}" for reason, count in _counted(segments).items())
-        raise UserError(f"nothing can be learned from {len(segments)} segments ({reasons})")
+    _require_some(segments)
     names = settings.reward.in_use
     defaults = np.array([getattr(RewardWeights(), name) for name in names])
     chosen = segments.where(segments.dropped == "")
     return segments, Material(chosen, data.where(data.penalty <= 0.0), names, defaults)
+
+
+def _require_some(segments: Segments) -> None:
+    if not (segments.dropped == "").any():
+        reasons = "; ".join(f"{reason}: {count}" for reason, count in _counted(segments).items())
+        raise UserError(f"nothing can be learned from {len(segments)} segments ({reasons})")
 
 
 def _doubted(
@@ -184,7 +195,6 @@ def _doubted(
         material.data,
         material.segments.run,
         found,
-        options.fixed,
         options.draws,
         lambda done, total: say("drawing runs", done, total),
     )

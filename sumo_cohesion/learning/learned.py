@@ -35,6 +35,7 @@ class Learned:
     predictions : every such prediction: run, model, horizon (s), how far it is off (m).
     warnings : what to mind before using the weights.
     about : how it was learned: source, steps, counts, digest of the demonstrations, versions.
+    anchor : the term that all weights are relative to.
     """
 
     reward: RewardWeights
@@ -45,6 +46,7 @@ class Learned:
     predictions: pd.DataFrame
     warnings: Sequence[str] = ()
     about: Mapping[str, Any] = field(default_factory=dict)
+    anchor: str = "lane"
 
     def __repr__(self) -> str:
         names = self.weights.loc[self.weights["identified"], "term"]
@@ -76,9 +78,7 @@ class Learned:
         """Weights, and models on held-out runs, as text."""
         lines = [f"{'term':20}{'default':>12}{'learned':>12}  90 % of a bootstrap over runs"]
         for row in self.weights.to_dict(orient="records"):
-            said = row["kept_default"] or "what the others are relative to"
-            if row["low"] < row["high"]:
-                said = f"{row['low']:.3g} to {row['high']:.3g}"
+            said = row["kept_default"] or self._interval(row)
             lines.append(f"{row['term']:20}{row['default']:12.4g}{row['learned']:12.4g}  {said}")
         lines.append(f"temperature {self.temperature:.3g}")
         if len(self.fit):
@@ -89,6 +89,13 @@ class Learned:
             lines.append(f"{row['model']:30}" + "".join(f"{cell:>9}" for cell in cells))
         return "\n".join(lines)
 
+    def _interval(self, row: Mapping[Any, Any]) -> str:
+        """Say how sure a weight is."""
+        if row["term"] == self.anchor:
+            return "what the others are relative to"
+        known = not isnan(row["low"])
+        return f"{row['low']:.3g} to {row['high']:.3g}" if known else "not worked out"
+
     def to_toml(self) -> str:
         """Return the weights and how they were learned, as TOML."""
         lines = [_FIRST_LINE, "# Use it: --set planner.reward=@FILE, anywhere.", ""]
@@ -97,10 +104,10 @@ class Learned:
             value = f"{row['term']} = {row['learned']:.{DIGITS}g}"
             if row["kept_default"]:
                 lines.append(f"{value}  # not learned: {row['kept_default']}")
-            elif row["low"] < row["high"]:
-                lines.append(f"{value}  # 90 %: {row['low']:.3g} to {row['high']:.3g}")
+            elif row["term"] == self.anchor:
+                lines.append(f"{value}  # {self._interval(row)}")
             else:
-                lines.append(f"{value}  # what the others are relative to")
+                lines.append(f"{value}  # 90 %: {self._interval(row)}")
         lines += ["", "[learned]", f"temperature = {self.temperature:.{DIGITS}g}"]
         lines += [f"{key} = {_toml(value)}" for key, value in self.about.items()]
         lines += [f"warnings = {_toml(list(self.warnings))}", ""]
@@ -135,6 +142,6 @@ def _toml(value: Any) -> str:
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, int | float):
-        return repr(value)
+        return repr(value if isinstance(value, int) else float(value))
     quoted = str(value).replace("\\", "\\\\").replace('"', '\\"')
     return '"' + "".join(c if c.isprintable() else " " for c in quoted) + '"'

@@ -24,10 +24,8 @@ from sumo_cohesion.planning.solvers.compiled import BUILDING
 from sumo_cohesion.planning.stage import N_STATES, StageParameters, make_stage
 from sumo_cohesion.state import BoolArray, FloatArray
 
-ROUNDING = 1e-10
-"""Error of a scaled control from rounding: without any, exact optima would have no temperature."""
-_AT_ONCE = 20_000
-"""Stages that are worked out at once."""
+_STAGES_AT_ONCE, _NUMBERS_AT_ONCE = 20_000, 8_000_000
+"""Of many segments so much is worked out at once: less would be slower, more fills the memory."""
 
 
 class Quadratics(NamedTuple):
@@ -48,7 +46,7 @@ class Quadratics(NamedTuple):
         """Free dimensions of every segment."""
         return np.asarray((~self.fixed).sum(axis=1), dtype=float)
 
-    def where(self, chosen: BoolArray) -> Quadratics:
+    def where(self, chosen: BoolArray | slice) -> Quadratics:
         """Return those of some segments."""
         return Quadratics(
             self.gradient[chosen], self.curvature[chosen], self.fixed[chosen], self.penalty[chosen]
@@ -69,9 +67,18 @@ class Score(NamedTuple):
 
 
 def quadratics(segments: Segments, settings: PlannerSettings) -> Quadratics:
-    """Work out gradient and curvature of every reward term in use, around every segment."""
+    """Work out gradient and curvature of every reward term in use, around one segment or more."""
+    functions = _stage_functions(settings, _lanes_of(segments, settings))
+    at_once = max(_STAGES_AT_ONCE // settings.horizon, 1)
+    parts = [
+        _quadratics(segments.where(slice(first, first + at_once)), *functions)
+        for first in range(0, len(segments), at_once)
+    ]
+    return Quadratics(*[np.concatenate(part) for part in zip(*parts, strict=True)])
+
+
+def _quadratics(segments: Segments, terms_of: Any, moved_by: Any) -> Quadratics:
     n, steps, _ = segments.controls.shape
-    terms_of, moved_by = _stage_functions(settings, _lanes_of(segments, settings))
     before = np.concatenate((segments.start[:, None, :4], segments.states[:, :-1]), axis=1)
     driven = np.concatenate((segments.start[:, None, 4:], segments.controls[:, :-1]), axis=1)
     rows = (np.concatenate((before, driven), axis=2), segments.controls, segments.stages)
@@ -79,7 +86,8 @@ def quadratics(segments: Segments, settings: PlannerSettings) -> Quadratics:
     landing = segments.states.reshape(n * steps, -1).T
     slopes, squares, penalty = _mapped(terms_of, [landing, *columns])
     (moves,) = _mapped(moved_by, columns)
-    k, width = len(settings.reward.theta), _LANDING + 2 + 2
+    width = _LANDING + 2 + 2
+    k = terms_of.size2_out(0)
     # A CasADi matrix of several blocks is a NumPy one with the blocks' columns in a row.
     slope = slopes.reshape(n, steps, k, width)
     square = squares.reshape(n, steps, k, width, width)
@@ -136,15 +144,10 @@ def _stage_functions(settings: PlannerSettings, n_lanes: int) -> tuple[Any, Any]
 def _mapped(function: Any, columns: list[FloatArray]) -> list[FloatArray]:
     """Call a function for every column; (columns, entries) of each of its outputs."""
     n = columns[0].shape[1]
-    found: list[list[FloatArray]] = [[] for _ in range(function.n_out())]
-    for first in range(0, n, _AT_ONCE):
-        part = [column[:, first : first + _AT_ONCE] for column in columns]
-        count = part[0].shape[1]
-        results = function.map(count).call(part)
-        for output, result in zip(found, results, strict=True):
-            # Blocks of columns, each column-major: its transpose is row-major.
-            output.append(np.asarray(result.full()).T.reshape(count, -1))
-    return [np.concatenate(parts) for parts in found]
+    with BUILDING:
+        mapped = function.map(n)
+    # Blocks of columns, each column-major: its transpose is row-major.
+    return [np.asarray(result.full()).T.reshape(n, -1) for result in mapped.call(columns)]
 
 
 def _chained(
@@ -175,6 +178,23 @@ def score(
     data: Quadratics, theta: FloatArray, weights: FloatArray, *, with_hessian: bool = False
 ) -> Score:
     """Log-likelihood of segments under theta (K,), each counted by its weight (N,)."""
+    n, at_once = len(data.gradient), max(_NUMBERS_AT_ONCE // data.curvature[0].size, 1)
+    each, misfit, gradient, hessian = zip(
+        *[
+            _score(data.where(part), theta, weights[part], with_hessian)
+            for part in [slice(first, first + at_once) for first in range(0, n, at_once)]
+        ],
+        strict=True,
+    )
+    return Score(
+        np.concatenate(each),
+        np.concatenate(misfit),
+        np.sum(gradient, axis=0),
+        np.sum(hessian, axis=0) if with_hessian else None,
+    )
+
+
+def _score(data: Quadratics, theta: FloatArray, weights: FloatArray, with_hessian: bool) -> Score:
     n, k, size, _ = data.curvature.shape
     flat = data.curvature.reshape(n, k, size * size)
     curvature = (theta @ flat).reshape(n, size, size)
@@ -183,13 +203,12 @@ def score(
     inverse = np.linalg.inv(curvature)
     _, log_determinant = np.linalg.slogdet(curvature)
     v = (inverse @ (theta @ data.gradient)[:, :, None])[:, :, 0]
-    spread = np.trace(data.curvature, axis1=2, axis2=3) * ROUNDING**2
-    misfit = ((theta @ data.gradient) * v).sum(axis=1) + spread @ theta
+    misfit = ((theta @ data.gradient) * v).sum(axis=1)
     each = 0.5 * (log_determinant - misfit - data.free * np.log(2.0 * np.pi))
     # d/dk: -G_k' v + 1/2 v' A_k v + 1/2 tr(A^-1 A_k)
     pushed = (data.curvature @ v[:, None, :, None])[:, :, :, 0]
     volume = (flat @ inverse.reshape(n, size * size, 1))[:, :, 0]
-    slopes = ((0.5 * pushed - data.gradient) @ v[:, :, None])[:, :, 0] + 0.5 * (volume - spread)
+    slopes = ((0.5 * pushed - data.gradient) @ v[:, :, None])[:, :, 0] + 0.5 * volume
     hessian = None
     if with_hessian:
         # -(G_k - A_k v)' A^-1 (G_l - A_l v) - 1/2 tr(A^-1 A_k A^-1 A_l)

@@ -6,12 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
-import pandas as pd
+from numpy.typing import NDArray
 
 from sumo_cohesion.learning.example import Example
 from sumo_cohesion.learning.motion import controls
 from sumo_cohesion.planning.problem import Problem
 from sumo_cohesion.planning.settings import PlannerSettings
+from sumo_cohesion.planning.solvers.compiled import BUILDING
 from sumo_cohesion.planning.solvers.transcription import Transcription
 from sumo_cohesion.planning.stage import CONTROL_SCALE, UNLIMITED, StageParameters
 from sumo_cohesion.road import RoadAhead
@@ -42,8 +43,8 @@ class Segments:
     dropped : (N,) why a segment cannot be an optimum of the planner's problem; "" if it can.
     """
 
-    run: FloatArray
-    vehicle: FloatArray
+    run: NDArray[np.object_]
+    vehicle: NDArray[np.object_]
     time: FloatArray
     start: FloatArray
     stages: FloatArray
@@ -52,12 +53,12 @@ class Segments:
     low: FloatArray
     high: FloatArray
     change: FloatArray
-    dropped: FloatArray
+    dropped: NDArray[np.object_]
 
     def __len__(self) -> int:
         return len(self.run)
 
-    def where(self, chosen: BoolArray) -> Segments:
+    def where(self, chosen: BoolArray | slice) -> Segments:
         """Return some of them."""
         return Segments(**{f.name: getattr(self, f.name)[chosen] for f in fields(self)})
 
@@ -75,7 +76,8 @@ def make_segments(examples: Sequence[Example], settings: PlannerSettings) -> Seg
     for every term in use.
     """
     n_lanes = max((e.road.lane_centre.shape[1] for e in examples), default=1)
-    layout, writer = StageParameters(settings, n_lanes), Transcription(settings, n_lanes)
+    with BUILDING:
+        layout, writer = StageParameters(settings, n_lanes), Transcription(settings, n_lanes)
     bends = layout.columns("road_curvature")
     n, steps = len(examples), settings.horizon
     start, stages = np.zeros((n, 6)), np.zeros((n, steps, layout.size))
@@ -123,7 +125,10 @@ def make_segments(examples: Sequence[Example], settings: PlannerSettings) -> Seg
 
 
 def problem_of(example: Example, settings: PlannerSettings, n_lanes: int) -> Problem:
-    """Return the problem that the nominal planner would have had."""
+    """Return the problem that the nominal planner would have had.
+
+    The speed that the driver would like to drive is to it what the limit is to a planner.
+    """
     steps, ego = settings.horizon, example.ego
     nothing, nowhere = (0.0,) * len(FEATURES), np.zeros(steps)
     return Problem(
@@ -184,9 +189,3 @@ def free_directions(segments: Segments) -> tuple[FloatArray, BoolArray]:
         basis[i] = np.concatenate((directions[rank:], directions[:rank])).T
         free[i, size - rank :] = False
     return basis, free
-
-
-def table(segments: Segments, columns: dict[str, FloatArray]) -> pd.DataFrame:
-    """One row per segment, with more columns."""
-    named = {"run": segments.run, "vehicle": segments.vehicle, "time": segments.time}
-    return pd.DataFrame({**named, **columns}).astype({"run": "string", "vehicle": "string"})

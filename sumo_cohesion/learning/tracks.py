@@ -142,16 +142,25 @@ class _Around:
 
     def __init__(self, recording: Recording) -> None:
         table, self._interval = recording.table, recording.interval
-        self._names = table["vehicle"].to_numpy(object)
+        self._names = table["vehicle"].to_numpy(str)
         self._times = table["time"].to_numpy(float)
         self._places = table[["x", "y"]].to_numpy(float)
         self._sizes = table[["length", "width"]].to_numpy(float)
         self._velocities = self._differences()
-        tick = np.rint(self._times / self._interval).astype(int)
-        order = np.argsort(tick, kind="stable")
-        values, starts = np.unique(tick[order], return_index=True)
-        rows = np.split(order, starts[1:])
-        self._at = dict(zip(values.tolist(), rows, strict=True))
+        self._order = np.argsort(self._times, kind="stable")
+        self._in_order = self._times[self._order]
+
+    def _rows_at(self, time: float) -> IntArray:
+        """Row of every vehicle nearest to a time, of those that are there.
+
+        Times of vehicles need not be those of each other.
+        """
+        reach = 0.51 * self._interval
+        first, end = np.searchsorted(self._in_order, (time - reach, time + reach))
+        rows = self._order[first:end]
+        nearest = rows[np.abs(self._times[rows] - time).argsort(kind="stable")]
+        _, of_each = np.unique(self._names[nearest], return_index=True)
+        return np.sort(nearest[of_each])
 
     def _differences(self) -> FloatArray:
         """Velocity (m/s) of every row: half-way to both neighbours of the same vehicle."""
@@ -170,7 +179,7 @@ class _Around:
         self, vehicle: str, time: float, ego: RoadState, road: Road, sensing_range: float
     ) -> FloatArray:
         """Return the others at a time in a road's frame, nearest first, as planners see them."""
-        rows = self._at.get(round(time / self._interval), np.empty(0, int))
+        rows = self._rows_at(time)
         rows = rows[self._names[rows] != vehicle]
         velocity = self._velocities[rows]
         late = (time - self._times[rows])[:, None]
