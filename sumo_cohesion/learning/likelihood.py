@@ -94,9 +94,10 @@ def _quadratics(segments: Segments, terms_of: Any, moved_by: Any) -> Quadratics:
     move = moves.reshape(n, steps, N_STATES + 2, N_STATES).swapaxes(2, 3)
     gradient, curvature = _chained(slope, square, move)
     basis, free = free_directions(segments)
-    gradient = np.matmul(gradient, basis) * free[:, None]
-    curvature = basis.swapaxes(1, 2)[:, None] @ curvature @ basis[:, None]
-    curvature *= (free[:, :, None] & free[:, None, :])[:, None]
+    held = ~free.all(axis=1)
+    z = (basis * free[:, None])[held]
+    gradient[held] = gradient[held] @ z
+    curvature[held] = z.swapaxes(1, 2)[:, None] @ curvature[held] @ z[:, None]
     return Quadratics(gradient, curvature, ~free, penalty.reshape(n, steps).sum(axis=1))
 
 

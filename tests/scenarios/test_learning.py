@@ -228,17 +228,12 @@ def test_runs_of_a_batch_that_failed_are_left_out(tmp_path: Path) -> None:
 def test_plans_that_cohesion_had_a_part_in_are_dropped_and_counted(cohesive: Path) -> None:
     plan = pd.read_parquet(cohesive / "plan.parquet").iloc[::5]
     drawn = plan["reward_cohesion"] != 0.0
-    assert drawn.sum() > 0
+    assert drawn.tolist() == [False] + [True] * 15  # nobody has been seen for long enough at first
     told = examples(cohesive, "plans")
     assert [e.unusable == "cohesion had a part in it" for e in told] == drawn.tolist()
-    reasons = {e.unusable for e in told}
-    if reasons == {"cohesion had a part in it"}:
-        with pytest.raises(UserError, match=r"cohesion had a part in it: 16"):
-            sc.learn(cohesive)
-    else:
-        found = sc.learn(cohesive, draws=0)
-        assert found.about["dropped"]["cohesion had a part in it"] == drawn.sum()
-        assert any("cohesion had a part in it" in warning for warning in found.warnings)
+    found = sc.learn(cohesive, draws=0)
+    assert found.about["dropped"] == {"cohesion had a part in it": 15}
+    assert any("cohesion had a part in it: 15" in warning for warning in found.warnings)
 
 
 def test_humans_are_seen_as_the_run_saw_them(by_sumo: Path) -> None:

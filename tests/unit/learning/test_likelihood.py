@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
@@ -257,3 +259,17 @@ def test_any_length_and_number_of_lanes_has_dense_shapes(horizon: int, n_lanes: 
     assert data.curvature.shape == (2, k, 2 * horizon, 2 * horizon)
     assert np.isfinite(data.curvature).all()
     assert np.isfinite(score(data, np.ones(k), np.ones(2)).each).all()
+
+
+def test_threads_that_learn_at_once_do_not_disturb_one_another() -> None:
+    controls = np.array([[0.002, 1.0], [-0.003, 2.5], [0.001, 1.2]])
+    both = [example(f * controls) for f in (1.0, 0.5)]
+    alone = quadratics(make_segments(both, of_terms(3)), of_terms(3))
+
+    def again(_: int) -> Quadratics:
+        return quadratics(make_segments(both, of_terms(3)), of_terms(3))
+
+    with ThreadPoolExecutor(4) as pool:
+        for found in pool.map(again, range(12)):
+            for one, other in zip(alone, found, strict=True):
+                assert np.array_equal(one, other)
