@@ -13,6 +13,8 @@ Three studies, each with tables in analysis/:
 - claims: every claim of the paper with each theta, after tune, beside the hand-set one, on the same
   seeds: learn_claims.csv.
 
+Each goes on from what the one before has left in results/learn.
+
 Demonstrations are driven on seeds from 1000 on, beta is tuned on 1000:1010, claims are of 0:20.
 learn.json has command, seeds and versions.
 """
@@ -54,6 +56,9 @@ CLAIM_SEEDS = range(20)
 SECONDS = 20.0
 TEMPERATURE = 1e-3
 """Of noisy demonstrations, in units of the lane's weight."""
+PLANNERS = ("nominal", "cohesive")
+THETAS = ("plans", "SUMO's humans", "real humans, smooth")
+"""What is learned and drives."""
 COUNTS, SUBSETS = (25, 50, 100, 200, 400), 20
 REPETITIONS, DRAWS = 20, 100
 NAMES, TRUTH = RewardWeights().in_use, np.array(RewardWeights().theta)
@@ -220,13 +225,15 @@ def learned(workers: int | None, real: Path | None) -> dict[str, Learned]:
     humans: dict[str, Any] = {"source": "humans", "desired": "own"}
     found = {
         "plans": learn(demonstrations("nominal", LEARN_SEEDS, workers)),
-        "SUMO's humans": learn(demonstrations("sumo", LEARN_SEEDS, workers), **humans),
+        "SUMO's humans": learn(demonstrations("sumo", LEARN_SEEDS, workers), draws=50, **humans),
     }
     if real is not None:
         scenes = sorted(real.glob("*.xml"))
         smooth, smoother = (2.0, 3.0), ["curvature_change", "acceleration_change"]
-        found["real humans"] = learn(scenes, smooth=smooth, **humans)
-        found["real humans, smooth"] = learn(scenes, smooth=smooth, also=smoother, **humans)
+        found["real humans"] = learn(scenes, smooth=smooth, hold_out=0.5, **humans)
+        found["real humans, smooth"] = learn(
+            scenes, smooth=smooth, also=smoother, hold_out=0.5, **humans
+        )
     for name, one in found.items():
         one.write(theta_file(name))
     return found
@@ -240,19 +247,24 @@ def theta_file(name: str) -> Path:
 def claims(names: Sequence[str], workers: int | None) -> pd.DataFrame:
     """Every claim with each theta, after tune, beside the hand-set weights."""
     tables = []
-    for name in ("hand-set", *names):
-        changed: Mapping[str, Any] = {}
-        beta = np.nan
-        if name != "hand-set":
-            beta = tune(theta_file(name), workers=workers).beta
-            weights = f"@{theta_file(name)}"
-            changed = {"planner.reward": weights, "cohesion.beta": weights}
+    known = pd.read_parquet(HERE / "runs.parquet")  # of make reproduce: the same seeds
+    known = known[known["seed"].isin(CLAIM_SEEDS) & known["planner"].isin(PLANNERS)]
+    runs = {case: known[known["case"] == case] for case in CASES}
+    tables.append(measured(runs).assign(theta="hand-set", beta=np.nan))
+    for name in names:
+        file = theta_file(name)
+        beta = tune(file, workers=workers).beta
+        changed = {"planner.reward": f"@{file}", "cohesion.beta": f"@{file}"}
         cases = {case: (scenario, {**o, **changed}) for case, (scenario, o) in CASES.items()}
-        folder = WORK / "claims" / theta_file(name).stem
-        runs = run_cases(cases, ("nominal", "cohesive"), list(CLAIM_SEEDS), workers, folder)
-        rows = pd.DataFrame([row for case in cases for row in measure(case, runs[case])])
-        tables.append(rows.assign(theta=name, beta=beta))
+        folder = WORK / "claims" / file.stem
+        runs = run_cases(cases, PLANNERS, list(CLAIM_SEEDS), workers, folder)
+        tables.append(measured(runs).assign(theta=name, beta=beta))
     return pd.concat(tables, ignore_index=True)
+
+
+def measured(runs: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
+    """Count every claim in every case."""
+    return pd.DataFrame([row for case, found in runs.items() for row in measure(case, found)])
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -265,13 +277,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     tables: dict[str, pd.DataFrame] = {}
     if "recovery" in parts:
         tables |= recovery(given.workers)
-    if {"learned", "claims"} & set(parts):
+    if "learned" in parts:
         found = learned(given.workers, given.real)
         for table in ("weights", "fit"):
             rows = [getattr(one, table).assign(theta=name) for name, one in found.items()]
             tables[table] = pd.concat(rows, ignore_index=True)
-        if "claims" in parts:
-            tables["claims"] = claims(list(found), given.workers)
+    if "claims" in parts:
+        driven = [name for name in THETAS if theta_file(name).is_file()]
+        tables["claims"] = claims(driven, given.workers)
     for name, table in tables.items():
         table.to_csv(HERE / f"learn_{name}.csv", index=False, float_format="%.5g")
         print(table.to_string(index=False))
