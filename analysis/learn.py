@@ -37,10 +37,11 @@ from sumo_cohesion import learn, tune
 from sumo_cohesion.batches.batch import batch
 from sumo_cohesion.demonstrations.folders import runs_in
 from sumo_cohesion.learning.fit import bootstrap, fit
-from sumo_cohesion.learning.learn import INTERVAL, rounded
+from sumo_cohesion.learning.learn import INTERVAL
 from sumo_cohesion.learning.learned import Learned
 from sumo_cohesion.learning.likelihood import Quadratics, quadratics
 from sumo_cohesion.learning.segments import Segments, free_directions, make_segments
+from sumo_cohesion.learning.told import rounded
 from sumo_cohesion.learning.tracks import Cutting
 from sumo_cohesion.planning import dynamics
 from sumo_cohesion.planning.reward import RewardWeights

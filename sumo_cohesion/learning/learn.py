@@ -15,8 +15,10 @@ from sumo_cohesion.learning.fit import UNKNOWN, Fit, bootstrap, fit
 from sumo_cohesion.learning.learned import DIGITS, Learned
 from sumo_cohesion.learning.likelihood import Quadratics, quadratics
 from sumo_cohesion.learning.prediction import (
+    DEFAULT,
+    FITTED,
     HORIZONS,
-    VELOCITY,
+    LEARNED,
     best_scale,
     displacements,
     likelihoods,
@@ -24,6 +26,13 @@ from sumo_cohesion.learning.prediction import (
 )
 from sumo_cohesion.learning.segments import Segments, make_segments
 from sumo_cohesion.learning.source import Source
+from sumo_cohesion.learning.told import (
+    FEW_RUNS,
+    fit_table,
+    segment_table,
+    warnings,
+    weight_table,
+)
 from sumo_cohesion.learning.tracks import Cutting
 from sumo_cohesion.planning.reward import RewardWeights
 from sumo_cohesion.planning.settings import PlannerSettings
@@ -34,17 +43,10 @@ from sumo_cohesion.versions import versions
 Progress = Callable[[str, int, int], None]
 """Called with (what is being done, how much of it is done, how much there is)."""
 
-FEW_SEGMENTS, FEW_RUNS = 30, 3
-MUCH_DROPPED = 0.3
-LEAST_MISFIT, MOST_MISFIT = 0.5, 2.0
-"""Between these is the median of q / f where the reward describes the driving."""
 DOWN_TO_ZERO = 0.1
 """Share of a weight below which the lower end of its interval is as good as zero."""
 DOUBTED = "its interval reaches down to zero"
 INTERVAL = (0.05, 0.95)
-LEARNED, FITTED, DEFAULT = "learned", "as fitted", "default"
-"""Models: what is learned, with defaults in place of what the demonstrations do not tell; the same
-without them; and the default weights."""
 
 
 @dataclass(frozen=True)
@@ -114,17 +116,17 @@ def learn_from(
     segments, material = _material(_examples(sources, how, say), settings, say)
     found, interval = _doubted(material, options, say)
     table, predictions = _tried(sources, how, settings, material, found, options, say)
-    rows = _segment_table(segments, found, material.data.free)
+    rows = segment_table(segments, found, material.data.free)
     runs = len(set(material.segments.run))
     return Learned(
         reward=_reward(found.names, found.weights),
         anchor=found.anchor,
         temperature=1.0 / found.scale,
-        weights=_weight_table(found, material.defaults, interval),
+        weights=weight_table(found, interval),
         segments=rows,
         fit=table,
         predictions=predictions,
-        warnings=_warnings(rows, found, table, runs, options),
+        warnings=warnings(rows, found, table, runs, exact=options.exact),
         about={
             **about,
             "steps": how.steps,
@@ -248,7 +250,7 @@ def _tried(
         },
     )
     say("predicting", 1, 1)
-    return _fit_table(told, predictions), predictions
+    return fit_table(told, predictions), predictions
 
 
 def _held_out(runs: Sequence[str], share: float) -> set[str]:
@@ -262,115 +264,6 @@ def _held_out(runs: Sequence[str], share: float) -> set[str]:
 def _reward(names: Sequence[str], weights: FloatArray) -> RewardWeights:
     pairs = zip(names, weights, strict=True)
     return RewardWeights(**{name: float(f"{weight:.{DIGITS}g}") for name, weight in pairs})
-
-
-def _fit_table(told: Mapping[str, float], predictions: pd.DataFrame) -> pd.DataFrame:
-    """One row per model: median log-likelihood per second, mean displacements (m)."""
-    off = predictions.pivot_table(index="model", columns="horizon", values="off", aggfunc="mean")
-    windows = predictions.groupby("model")["example"].nunique()
-    rows = []
-    for model in dict.fromkeys([*told, *off.index]):
-        row: dict[str, object] = {"model": model, "log_likelihood": told.get(model, np.nan)}
-        for horizon in HORIZONS:
-            known = model in off.index and horizon in off.columns
-            row[f"off_{horizon:g}s"] = off.loc[model, horizon] if known else np.nan
-        rows.append({**row, "windows": int(windows.get(model, 0))})
-    return as_table("fit", rows)
-
-
-def _weight_table(
-    found: Fit, defaults: FloatArray, interval: tuple[FloatArray, FloatArray] | None
-) -> pd.DataFrame:
-    nothing = np.full(len(found.names), np.nan)
-    low, high = interval or (nothing, nothing)
-    known = [name not in found.kept_default for name in found.names]
-    free = [name not in found.kept_default and name != found.anchor for name in found.names]
-    return as_table(
-        "weights",
-        {
-            "term": found.names,
-            "default": defaults,
-            "learned": found.weights,
-            "low": np.where(free, rounded(low, np.floor), np.nan),
-            "high": np.where(free, rounded(high, np.ceil), np.nan),
-            "error": found.error,
-            "identified": known,
-            "kept_default": [found.kept_default.get(name, "") for name in found.names],
-            "share": found.share,
-        },
-    )
-
-
-def rounded(values: FloatArray, towards: Callable[[FloatArray], FloatArray]) -> FloatArray:
-    """Round outwards to three digits: what a solver's tolerance leaves open is unknown, too."""
-    digit = 10.0 ** (np.floor(np.log10(np.maximum(np.abs(values), 1e-300))) - 2.0)
-    return towards(values / digit) * digit
-
-
-def _segment_table(segments: Segments, found: Fit, free: FloatArray) -> pd.DataFrame:
-    usable = segments.dropped == ""
-    each, misfit, free_of = (np.full(len(segments), np.nan) for _ in range(3))
-    kept = np.zeros(len(segments), dtype=bool)
-    each[usable], misfit[usable], kept[usable] = found.each, found.misfit, found.kept
-    free_of[usable] = free
-    reason = np.where(usable & ~kept, "trimmed", segments.dropped)
-    return as_table(
-        "segments",
-        {
-            "run": segments.run,
-            "vehicle": segments.vehicle,
-            "time": segments.time,
-            "log_likelihood": each,
-            "free": free_of,
-            "misfit": misfit,
-            "kept": kept,
-            "reason": reason,
-        },
-    )
-
-
-def _warnings(
-    rows: pd.DataFrame, found: Fit, table: pd.DataFrame, runs: int, options: Options
-) -> tuple[str, ...]:
-    said = []
-    usable, n = rows["misfit"].notna(), len(rows)
-    if usable.sum() < FEW_SEGMENTS or runs < FEW_RUNS:
-        said.append(
-            f"{usable.sum()} segments from {runs} runs are few: give {FEW_SEGMENTS} or more from "
-            f"{FEW_RUNS} or more"
-        )
-    dropped = rows.loc[~usable, "reason"].value_counts()
-    if dropped.sum() > MUCH_DROPPED * n:
-        why = ", ".join(f"{reason}: {count}" for reason, count in dropped.items())
-        said.append(f"{dropped.sum()} of {n} segments are no optimum of this problem ({why})")
-    middle = float(np.median(found.misfit))
-    if not options.exact and not LEAST_MISFIT < middle < MOST_MISFIT:
-        said.append(
-            f"the median misfit is {middle:.2g}, not about 1: the reward does not describe this "
-            "driving"
-        )
-    said += _beaten(table)
-    for name, why in found.kept_default.items():
-        if name not in options.fixed:
-            said.append(f"{name} keeps its default: {why}")
-    return tuple(said)
-
-
-def _beaten(table: pd.DataFrame) -> list[str]:
-    """Say where simpler models do better on what was held out."""
-    if not len(table):
-        return []
-    said = []
-    told = dict(zip(table["model"], table["log_likelihood"], strict=True))
-    if told[LEARNED] < told[DEFAULT]:
-        said.append("held-out driving is less likely than with the default weights")
-    for horizon in reversed(HORIZONS):
-        off = dict(zip(table["model"], table[f"off_{horizon:g}s"], strict=True))
-        if not np.isnan(off[LEARNED]):
-            if off[LEARNED] > off[VELOCITY]:
-                said.append(f"{horizon:g} s ahead, constant velocity predicts it better")
-            break
-    return said
 
 
 def _counted(segments: Segments) -> dict[str, int]:

@@ -21,6 +21,9 @@ from sumo_cohesion.tables.columns import as_table
 HORIZONS = (1.0, 2.0, 3.0)
 """Seconds after which a prediction is compared with what was driven."""
 VELOCITY = "constant velocity"
+LEARNED, FITTED, DEFAULT = "learned", "as fitted", "default"
+"""Models: what is learned, with defaults in place of what the demonstrations do not tell; the same
+without them; and the default weights."""
 WINDOWS = 100
 """Held-out windows that are predicted, at most."""
 
