@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -57,7 +57,7 @@ class Run:
     """One run's tables; they are read when they are asked for.
 
     ``special`` vehicles do not drive as humans do: those that the scenario hides or calls special.
-    ``place`` is where its tables are, which no other run's are.
+    ``sensing_range`` (m) is how far its planner saw; ``place`` is where its tables are, which no other run's are.
     """
 
     name: str
@@ -66,6 +66,7 @@ class Run:
     settings: PlannerSettings
     planner: str
     special: frozenset[str]
+    sensing_range: float
     table: Callable[[str], pd.DataFrame]
 
     def source(self, kind: Kind) -> Source:
@@ -158,7 +159,8 @@ class TracksOf:
         ordered = trajectory.sort_values(["vehicle", "time"], kind="stable")
         table = ordered[list(COLUMNS)].reset_index(drop=True)
         roads = dict.fromkeys(sorted(vehicles), self.run.road)
-        return cut(Recording(self.run.name, table, roads, STEP), how)
+        recording = Recording(self.run.name, table, roads, STEP)
+        return cut(recording, replace(how, sensing_range=self.run.sensing_range))
 
 
 def runs_in(folder: Path) -> list[Run]:
@@ -180,6 +182,7 @@ def _of_folder(path: Path, root: Path) -> Run:
         network, route = Path(info["network"]), info["route"]
         planner, settings = info["planner"], info["settings"]
         special = frozenset([*info["hidden"], *info["special"]])
+        seen = float(info["scenario"]["sensing"]["range"])
         settings = validated(PlannerSettings, settings, f"{path / RUN_FILE}: settings")
         name = f"{root.name}/{path.relative_to(root).as_posix()}" if path != root else root.name
         road = road_of(network, route)
@@ -189,7 +192,14 @@ def _of_folder(path: Path, root: Path) -> Run:
             f"it again"
         ) from None
     return Run(
-        name, path, road, settings, planner, special, lambda t: _parquet(path / f"{t}.parquet")
+        name,
+        path,
+        road,
+        settings,
+        planner,
+        special,
+        seen,
+        lambda t: _parquet(path / f"{t}.parquet"),
     )
 
 
@@ -223,6 +233,7 @@ def _of_batch(folder: Path) -> list[Run]:
                 setup.settings,
                 point.planner,
                 frozenset(setup.not_human),
+                setup.scenario.sensing.range,
                 _kept(folder, run),
             )
     if not found:

@@ -64,7 +64,7 @@ def write_report(learned: Learned, folder: str | Path) -> Path:
         for name in LEARNED:
             getattr(learned, name).to_parquet(new / f"{name}.parquet", index=False)
         (new / "theta.toml").write_text(learned.to_toml(), encoding="utf-8")
-        save(draw_weights(learned.weights), new / "weights.png")
+        save(draw_weights(learned.weights, learned.anchor), new / "weights.png")
         save(draw_misfit(learned.segments), new / "misfit.png")
         if len(learned.predictions):
             save(draw_predictions(learned.predictions), new / "predictions.png")
@@ -74,12 +74,15 @@ def write_report(learned: Learned, folder: str | Path) -> Path:
 # Weights
 
 
-def draw_weights(weights: pd.DataFrame) -> Figure:
-    """Draw weights and their 90 % intervals as multiples of their defaults, one term a line."""
+def draw_weights(weights: pd.DataFrame, anchor: str) -> Figure:
+    """Draw weights and their 90 % intervals as multiples of their defaults, one term a line.
+
+    ``anchor`` is the term that all are relative to.
+    """
     figure = new_figure(WIDTH, 0.42 * len(weights) + 1.3)
     axis = figure.subplots()
     axis.axvline(1.0, color="0.8", lw=1.0, zorder=0.5)
-    told = [_draw_weight(axis, y, row) for y, (_, row) in enumerate(weights.iterrows())]
+    told = [_draw_weight(axis, y, row, anchor) for y, (_, row) in enumerate(weights.iterrows())]
     axis.set_xscale("log")
     _mark_multiples(axis)
     axis.set_yticks(range(len(weights)), list(weights["term"]))
@@ -95,14 +98,14 @@ def draw_weights(weights: pd.DataFrame) -> Figure:
     return figure
 
 
-def _draw_weight(axis: Axes, y: int, row: pd.Series) -> str:
+def _draw_weight(axis: Axes, y: int, row: pd.Series, anchor: str) -> str:
     """Draw one weight, and return what there is to say about it."""
     value = f"{row['learned']:.3g}"
     if row["default"] == 0.0:  # no multiple of nothing
         value += ", off by default"
     else:
         learned, relative = "learned", "what the others are relative to"
-        kind = relative if row["error"] == 0.0 else learned
+        kind = relative if row["term"] == anchor else learned
         kind = "not learned" if row["kept_default"] else kind
         ends = np.array([row["low"], row["high"]]) / row["default"]
         axis.plot(ends, [y, y], color=KEPT, lw=2.0, marker="|", ms=9, mew=2.0, zorder=2.5)

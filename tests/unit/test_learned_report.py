@@ -103,7 +103,7 @@ def points(axis: Axes) -> dict[str, list[tuple[float, float]]]:
 
 
 def test_weights_are_multiples_of_their_default() -> None:
-    (axis,) = report.draw_weights(WEIGHTS).axes
+    (axis,) = report.draw_weights(WEIGHTS, "lane").axes
     assert axis.get_xscale() == "log"
     assert points(axis) == {
         "what the others are relative to": [(1.0, 0.0)],
@@ -127,7 +127,7 @@ def test_weights_are_multiples_of_their_default() -> None:
 
 
 def test_without_a_bootstrap_no_interval_is_promised() -> None:
-    (axis,) = report.draw_weights(WEIGHTS.assign(low=NAN, high=NAN)).axes
+    (axis,) = report.draw_weights(WEIGHTS.assign(low=NAN, high=NAN), "lane").axes
     assert points(axis)["learned"] == [(2.0, 2.0), (0.5, 3.0)]
     assert axis.get_xlabel() == "weight / default"
 
