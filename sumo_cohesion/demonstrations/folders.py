@@ -57,7 +57,8 @@ class Run:
     """One run's tables; they are read when they are asked for.
 
     ``special`` vehicles do not drive as humans do: those that the scenario hides or calls special.
-    ``sensing_range`` (m) is how far its planner saw; ``place`` is where its tables are, which no other run's are.
+    ``sensing_range`` (m) is how far its planner saw; ``place`` is where its tables are, which no
+    other run's are.
     """
 
     name: str
