@@ -8,12 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from sumo_cohesion.learning.likelihood import Quadratics, score
+from sumo_cohesion.learning.likelihood import Quadratics, Score, score
 from sumo_cohesion.state import BoolArray, FloatArray
 
 ROUNDS = 6
@@ -198,16 +199,17 @@ def maximise(
     columns[free, np.arange(1, 1 + len(free))] = 1.0
     rounded = ROUNDING**2 * counts @ np.einsum("nkii->nk", some.curvature)
 
+    @lru_cache(maxsize=1)  # value and Hessian are asked for one after the other
+    def score_at(x: tuple[float, ...]) -> Score:
+        return score(some, (columns * np.exp(x)).sum(axis=1), counts, with_hessian=True)
+
     def loss(x: FloatArray) -> tuple[float, FloatArray]:
-        chain = columns * np.exp(x)
-        theta = chain.sum(axis=1)
-        found = score(some, theta, counts)
-        value = 0.5 * float(rounded @ theta) - float(counts @ found.each)
+        chain, found = columns * np.exp(x), score_at(tuple(x))
+        value = 0.5 * float(rounded @ chain.sum(axis=1)) - float(counts @ found.each)
         return value / total, np.asarray((0.5 * rounded - found.gradient) @ chain / total)
 
     def bend(x: FloatArray) -> FloatArray:
-        chain = columns * np.exp(x)
-        found = score(some, chain.sum(axis=1), counts, with_hessian=True)
+        chain, found = columns * np.exp(x), score_at(tuple(x))
         assert found.hessian is not None
         slope = (0.5 * rounded - found.gradient) @ chain
         return np.asarray((np.diag(slope) - chain.T @ found.hessian @ chain) / total)
