@@ -24,7 +24,10 @@ UNCERTAIN = 1.0
 ROUNDING = 1e-14
 """Error of a scaled control from rounding: without any, exact optima would have no temperature."""
 ASKED, UNKNOWN = "as asked for", "the demonstrations do not tell it"
+SMALLER = "the demonstrations tell only that it is smaller"
 """Why a weight was not learned."""
+_CLEARLY = 3.0
+"""Log-likelihood (nats) that is lost where driving speaks against a weight."""
 _FURTHEST = 18.0
 """How far (natural logarithm) a weight may fall from where it starts: 8 powers of ten."""
 _FAINT, _GAIN = 1e-6, 1e-2
@@ -152,7 +155,18 @@ def fit(
         share=share,
     )
     unknown = [name for name, e in zip(names, error, strict=True) if not e <= UNCERTAIN]
-    return result.without(dict.fromkeys(unknown, UNKNOWN))
+    result = result.without(dict.fromkeys(unknown, UNKNOWN))
+    return result.without({name: SMALLER for name in unknown if _is_too_much(data, result, name)})
+
+
+def _is_too_much(data: Quadratics, found: Fit, name: str) -> bool:
+    """Tell if the default of a weight that is near zero makes the driving much less likely."""
+    at, theta = found.names.index(name), found.theta.copy()
+    theta[at] = found.scale * found.defaults[at]
+    if theta[at] <= found.theta[at]:
+        return False
+    there = score(data, theta, np.ones(len(data.free))).each
+    return float((found.each - there)[found.kept].sum()) > _CLEARLY
 
 
 def _units(

@@ -84,6 +84,12 @@ def test_what_the_data_do_not_tell_keeps_its_default(term: int) -> None:
     assert found.weights[other] == pytest.approx(TRUE[other], rel=0.3)
 
 
+def test_driving_that_speaks_against_a_default_says_so() -> None:
+    found = fit(data_of(SCALE * TRUE * [1.0, 1.0, 0.0]), NAMES, DEFAULTS, {}, 1.0)
+    assert found.kept_default == {"car": "the demonstrations tell only that it is smaller"}
+    assert found.weights[2] == DEFAULTS[2]
+
+
 def test_a_lane_of_which_nothing_is_known_is_no_anchor() -> None:
     theta = SCALE * TRUE * [0.0, 1.0, 1.0]
     found = fit(without(data_of(theta), 0), NAMES, DEFAULTS, {}, 1.0)
