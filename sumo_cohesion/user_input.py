@@ -195,6 +195,8 @@ def refuse_repeats(values: Iterable[object]) -> None:
         raise ValueError(f"{value} is listed twice")
 
 
+_KINDS = ("bool", "float", "int", "str")
+"""What pydantic adds to a place where a value may be of several kinds: which it was taken for."""
 _IN_TOML = {
     "tuple_type": "should be a list, in brackets",
     "list_type": "should be a list, in brackets",
@@ -209,10 +211,13 @@ def validated(model: type[Model], data: object, where: str) -> Model:
     try:
         return model.model_validate(data)
     except ValidationError as error:
-        # A misspelt key is also a missing one; name the misspelling.
-        found = sorted(error.errors(), key=lambda e: e["type"] != "extra_forbidden")
+        # A misspelt key is also a missing one; name the misspelling. What is one of several kinds
+        # is none of them for several reasons; name the one that says most.
+        said_first = ("extra_forbidden", "value_error")
+        found = sorted(error.errors(), key=lambda e: [e["type"] != kind for kind in said_first])
         first = found[0]
-        key = ".".join(str(part) for part in first["loc"])
+        parts = [str(part) for part in first["loc"]]
+        key = ".".join(p for p in parts if p not in _KINDS and not p.startswith("function-"))
         also = {str(e["loc"][0]) for e in found if e["loc"] and e["type"] != "missing"}
         also -= {str(part) for part in first["loc"][:1]}
         rest = f"; look at {', '.join(sorted(also))}, too" if also else ""
