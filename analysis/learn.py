@@ -120,7 +120,7 @@ def recovery(workers: int | None) -> dict[str, pd.DataFrame]:
                     "found": int(np.isfinite(angles).sum()),
                     "angle_median": np.nanmedian(angles),
                     "angle_90": np.nanquantile(angles, 0.9),
-                    **dict(zip(NAMES, np.nanmedian(np.array(weights), axis=0), strict=True)),
+                    **pd.DataFrame(weights, columns=list(NAMES)).median().to_dict(),
                 }
             )
         del segments

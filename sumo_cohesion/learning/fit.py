@@ -33,6 +33,8 @@ _FURTHEST = 18.0
 _FAINT, _GAIN = 1e-6, 1e-2
 """Share of all curvature below which a term is hardly there, and what likelihood (nats) it must
 promise to be tried again with that share."""
+_BEGINNINGS = 3
+"""Of the search, at most."""
 _STRIDE = 4.0
 """How far it may go at once: what a model promises farther away, exponentials do not keep."""
 
@@ -237,10 +239,13 @@ def maximise(
     misfit = float(counts @ score(some, theta, counts).misfit + rounded @ theta)
     x0 += np.log(total / misfit) if misfit > 0.0 else 0.0
     options = {"maxiter": 200, "gtol": 1e-7, "max_trust_radius": _STRIDE}
-    x, lifted = x0, x0
-    while lifted is not None:
-        x = minimize(loss, lifted, jac=True, hess=bend, method="trust-exact", options=options).x
+    x, begin = x0, x0
+    for _ in range(_BEGINNINGS):
+        x = minimize(loss, begin, jac=True, hess=bend, method="trust-exact", options=options).x
         lifted = _lifted(x, columns, some, counts)
+        if lifted is None:
+            break
+        begin = lifted
     errors = _errors(total * bend(x))
     # What only rounding bounds is not known.
     told = np.abs(some.gradient).max(initial=0.0) > 0.0
@@ -263,13 +268,9 @@ def _lifted(
     wanted = _FAINT * strength.sum()
     faint = (strength > 0.0) & (strength < 0.5 * wanted)
     gain = score(data, theta, counts).gradient @ chain
-    gain[faint] *= wanted / strength[faint]
-    grows = faint & (gain > _GAIN)
-    return (
-        np.where(grows, x + np.log(wanted / np.maximum(strength, 1e-300)), x)
-        if grows.any()
-        else None
-    )
+    rise = np.log(wanted) - np.log(np.where(faint, strength, wanted))
+    grows = faint & (gain * np.exp(np.minimum(rise, 600.0)) > _GAIN)
+    return x + np.where(grows, rise, 0.0) if grows.any() else None
 
 
 def _errors(curvature: FloatArray) -> FloatArray:

@@ -58,7 +58,8 @@ def weight_table(found: Fit, interval: tuple[FloatArray, FloatArray] | None) -> 
 def rounded(values: FloatArray, towards: Callable[[FloatArray], FloatArray]) -> FloatArray:
     """Round outwards to three digits: what a solver's tolerance leaves open is unknown, too."""
     digit = 10.0 ** (np.floor(np.log10(np.maximum(np.abs(values), 1e-300))) - 2.0)
-    return towards(values / digit) * digit
+    # Written and read again: 120 times 1e-6 is a hair less than 0.00012.
+    return np.array([float(f"{value:.3g}") for value in towards(values / digit) * digit])
 
 
 def segment_table(segments: Segments, found: Fit, free: FloatArray) -> pd.DataFrame:
