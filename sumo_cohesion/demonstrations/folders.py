@@ -32,6 +32,7 @@ from sumo_cohesion.planning.settings import PlannerSettings
 from sumo_cohesion.road import Road
 from sumo_cohesion.simulation.setup import prepare, road_of
 from sumo_cohesion.state import EGO, STEP
+from sumo_cohesion.tables.damaged import tables_of
 from sumo_cohesion.tables.rollout import RUN_FILE
 from sumo_cohesion.user_input import validated
 
@@ -117,6 +118,10 @@ class PlansOf:
 
     def examples(self, how: Cutting) -> Sequence[Example]:
         """Take every plan that is half its own length after the one before."""
+        with tables_of(self.run.place):
+            return self._examples(how)
+
+    def _examples(self, how: Cutting) -> Sequence[Example]:
         run, steps = self.run, self.run.settings.horizon
         plan, horizon = run.read("plan"), run.read("horizon")
         if not len(horizon):
@@ -149,6 +154,10 @@ class TracksOf:
 
     def examples(self, how: Cutting) -> Sequence[Example]:
         """Cut the vehicles' tracks."""
+        with tables_of(self.run.place):
+            return self._examples(how)
+
+    def _examples(self, how: Cutting) -> Sequence[Example]:
         trajectory = self.run.trajectory()
         if self.kind == "driven":
             vehicles, trajectory = {EGO}, trajectory[trajectory["visible"]]
@@ -172,9 +181,10 @@ def runs_in(folder: Path) -> list[Run]:
     UserError
         If there are none, or one of them is not whole.
     """
-    if is_batch(folder):
-        return _of_batch(folder)
-    return [_of_folder(path, folder) for path in run_folders(folder)]
+    with tables_of(folder):
+        if is_batch(folder):
+            return _of_batch(folder)
+        return [_of_folder(path, folder) for path in run_folders(folder)]
 
 
 def _of_folder(path: Path, root: Path) -> Run:

@@ -24,6 +24,8 @@ from sumo_cohesion.traffic.contact import contacts
 from sumo_cohesion.traffic.library import captured_stderr, first_error, load_libsumo, load_window
 from sumo_cohesion.traffic.outputs import SumoOutputs
 
+_LARGEST = 10_000.0
+"""Length or width (m) of the largest vehicle that can be meant."""
 _POSITION_TOLERANCE = 0.05
 """Metres by which SUMO's car may differ from the driven one. Measured: below 0.001."""
 _KEEP_ROUTE_EXACT = 2
@@ -374,7 +376,7 @@ class Simulator:
         if name not in self._sizes:
             vehicle = self._sumo.vehicle
             size = (float(vehicle.getLength(name)), float(vehicle.getWidth(name)))
-            if not all(map(isfinite, size)):
+            if not all(value <= _LARGEST for value in size):  # NaN is not, either
                 raise UserError(
                     f"vehicle {name!r} is {size[0]:g} m long and {size[1]:g} m wide; mend its type"
                 )

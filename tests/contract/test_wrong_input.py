@@ -278,17 +278,21 @@ def test_no_screen_for_the_window(invoke: Invoke, monkeypatch: pytest.MonkeyPatc
     assert_one_line(invoke("run", "stalled", "--gui"), "--gui", "scenario export")
 
 
-@pytest.mark.parametrize("key", ["length", "width"])
-def test_a_vehicle_of_infinite_size(
-    invoke: Invoke, scenario: Callable[..., Path], key: str
+@pytest.mark.parametrize(
+    ("key", "size"), [("length", "inf"), ("width", "inf"), ("width", "1e308"), ("length", "2e4")]
+)
+def test_a_vehicle_of_no_possible_size(
+    invoke: Invoke, scenario: Callable[..., Path], key: str, size: str
 ) -> None:
     Path("more.add.xml").write_text(
-        f'<additional><vType id="endless" laneChangeModel="SL2015" {key}="inf"/>'
+        f'<additional><vType id="endless" laneChangeModel="SL2015" {key}="{size}"/>'
         '<vehicle id="odd" type="endless" depart="0" departLane="2" departPos="300">'
         '<route edges="west east"/></vehicle></additional>'
     )
     path = scenario("duration = 40.0", 'duration = 2.0\nadditional = ["more.add.xml"]')
-    assert_one_line(invoke("run", path, "--planner", "sumo"), "'odd'", "inf m", "mend its type")
+    assert_one_line(
+        invoke("run", path, "--planner", "sumo"), "'odd'", f"{float(size):g} m", "mend its type"
+    )
 
 
 @pytest.mark.slow

@@ -375,6 +375,14 @@ def test_damaged_tables_are_named(planned: Path, tmp_path: Path) -> None:
         assert "run it again" in said
 
 
+def test_tables_that_make_no_sense_are_one_line(planned: Path, tmp_path: Path) -> None:
+    folder = copy(planned / "speeding", tmp_path / "none")
+    path = folder / "trajectory.parquet"
+    pd.read_parquet(path).assign(visible=None).to_parquet(path, index=False)
+    said = refused(folder, source="driven")
+    assert "its tables are not those that were written" in said
+
+
 def test_tables_of_another_kind_are_named(planned: Path, tmp_path: Path) -> None:
     folder = copy(planned / "speeding", tmp_path / "torn")
     data = (folder / "horizon.parquet").read_bytes()
