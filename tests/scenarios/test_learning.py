@@ -27,6 +27,8 @@ from sumo_cohesion.planning.solvers.transcription import Transcription
 from sumo_cohesion.planning.stage import CONTROL_SCALE, StageParameters
 from sumo_cohesion.state import EGO, FloatArray
 
+pytestmark = pytest.mark.slow  # they all learn from runs that are driven for them
+
 SHORT = {"duration": 8.0}
 RUNS = (("stalled", 1), ("speeding", 2), ("ambulance", 3))
 THETA = np.array(RewardWeights().theta)
@@ -117,7 +119,6 @@ def test_a_plan_has_no_gradient_at_the_planners_own_weights(planned: Path) -> No
         assert np.median(own.max(axis=1) / parts) < 1e-4
 
 
-@pytest.mark.slow
 def test_plans_of_three_runs_tell_the_planners_weights_but_for_the_edge(
     planned: Path, tmp_path: Path
 ) -> None:
@@ -146,7 +147,6 @@ def test_plans_of_three_runs_tell_the_planners_weights_but_for_the_edge(
     assert len(sc.run("speeding", "nominal", overrides=with_it).plan) == 10
 
 
-@pytest.mark.slow
 def test_without_draws_only_the_anchor_is_what_others_are_relative_to(planned: Path) -> None:
     found = sc.learn(planned, draws=0)
     assert found.anchor == "lane"
@@ -154,7 +154,6 @@ def test_without_draws_only_the_anchor_is_what_others_are_relative_to(planned: P
         assert text.count("what the others are relative to") == 1
 
 
-@pytest.mark.slow
 def test_a_term_that_is_off_by_default_is_learned_from_a_planner_that_has_it(
     tmp_path: Path,
 ) -> None:
@@ -168,7 +167,6 @@ def test_a_term_that_is_off_by_default_is_learned_from_a_planner_that_has_it(
         assert table[name] == pytest.approx(value, rel=0.05)
 
 
-@pytest.mark.slow
 def test_batches_and_comparisons_demonstrate_like_runs(planned: Path, tmp_path: Path) -> None:
     """A grid of settings that a file has, and one whose points come to the same for nominal."""
     theta = tmp_path / "theta.toml"
@@ -203,7 +201,6 @@ def test_batches_and_comparisons_demonstrate_like_runs(planned: Path, tmp_path: 
     )
 
 
-@pytest.mark.slow
 def test_runs_of_a_batch_that_failed_are_left_out(tmp_path: Path) -> None:
     experiment = {
         "name": "some",

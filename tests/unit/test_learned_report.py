@@ -66,6 +66,7 @@ LEARNED_HERE = Learned(
 )
 
 
+@pytest.mark.slow
 def test_the_report_holds_tables_weights_and_figures(tmp_path: Path) -> None:
     folder = report.write_report(LEARNED_HERE, tmp_path / "found")
     for name in LEARNED:
@@ -77,6 +78,7 @@ def test_the_report_holds_tables_weights_and_figures(tmp_path: Path) -> None:
         assert (folder / f"{name}.png").stat().st_size > 5_000
 
 
+@pytest.mark.slow
 def test_there_is_no_figure_of_what_was_not_predicted(tmp_path: Path) -> None:
     nothing = replace(LEARNED_HERE, predictions=as_table("predictions", []))
     folder = report.write_report(nothing, tmp_path)
@@ -193,6 +195,7 @@ def test_errors_are_means_of_windows_with_intervals_over_runs() -> None:
     assert np.isnan([row.low, row.high]).all()  # one run says nothing of others
 
 
+@pytest.mark.slow
 def test_an_interval_covers_the_mean_as_often_as_it_says() -> None:
     rng = np.random.default_rng(0)
     means = rng.normal(5.0, 1.0, (200, 30))  # of 200 times 30 runs with two windows each

@@ -44,6 +44,7 @@ def test_weights_and_temperature_are_found_again() -> None:
     )
 
 
+@pytest.mark.slow
 def test_the_standard_error_is_how_far_off_fits_are() -> None:
     fits = [fit(data_of(n=60, seed=s), NAMES, DEFAULTS, {}, 1.0) for s in range(40)]
     off = np.array([np.log(f.theta / (SCALE * TRUE)) for f in fits])
@@ -202,6 +203,7 @@ def of_two_opinions() -> tuple[Quadratics, np.ndarray]:
     return data, np.repeat([f"run {i}" for i in range(4)], 75).astype(object)
 
 
+@pytest.mark.slow
 def test_the_bootstrap_draws_whole_runs() -> None:
     data, runs = of_two_opinions()
     found = fit(data, NAMES, DEFAULTS, {}, 1.0)

@@ -261,6 +261,7 @@ def test_any_length_and_number_of_lanes_has_dense_shapes(horizon: int, n_lanes: 
     assert np.isfinite(score(data, np.ones(k), np.ones(2)).each).all()
 
 
+@pytest.mark.slow
 def test_threads_that_learn_at_once_do_not_disturb_one_another() -> None:
     controls = np.array([[0.002, 1.0], [-0.003, 2.5], [0.001, 1.2]])
     both = [example(f * controls) for f in (1.0, 0.5)]
