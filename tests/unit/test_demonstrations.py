@@ -88,6 +88,7 @@ def recording(driven: tuple[Path, pd.DataFrame], network: Network) -> Recording:
     return read_fcd(driven[0], network, [driven[0].parent / "d.rou.xml"])
 
 
+@pytest.mark.slow  # SUMO drives for all of them
 class TestFloatingCarData:
     def test_centres_and_sizes_are_those_of_the_simulation(
         self, driven: tuple[Path, pd.DataFrame], recording: Recording

@@ -79,6 +79,9 @@ def controllers(planner: PlannerSettings) -> dict[str, Mpc]:
     return {name: Mpc(planner.model_copy(update={"solver": name}), 3) for name in SOLVERS}
 
 
+SEEDS = [pytest.param(s, marks=[pytest.mark.slow] if s > 4 else []) for s in range(25)]
+
+
 @pytest.fixture(scope="module")
 def solvers() -> dict[str, Mpc]:
     return controllers(SETTINGS)
@@ -89,7 +92,7 @@ def smooth_solvers() -> dict[str, Mpc]:
     return controllers(SMOOTH)
 
 
-@pytest.mark.parametrize("seed", range(25))
+@pytest.mark.parametrize("seed", SEEDS)
 def test_all_solvers_agree_and_keep_their_promises(solvers: dict[str, Mpc], seed: int) -> None:
     value = {}
     for name, mpc in solvers.items():
@@ -107,7 +110,7 @@ def test_all_solvers_agree_and_keep_their_promises(solvers: dict[str, Mpc], seed
     assert value["ilqr"] >= others[1] - scale  # no worse than the middle one of the others
 
 
-@pytest.mark.parametrize("seed", range(25))
+@pytest.mark.parametrize("seed", SEEDS)
 def test_all_solvers_agree_on_the_optional_terms(smooth_solvers: dict[str, Mpc], seed: int) -> None:
     asked = problem(seed)._replace(theta=SMOOTH.reward.theta)
     found, value = {}, {}
