@@ -73,7 +73,7 @@ class Run:
 
     def source(self, kind: Kind) -> Source:
         """Return the driving that is asked for."""
-        return PlansOf(self) if kind == "plans" else TracksOf(self, kind)
+        return DrivingOf(self, kind)
 
     def read(self, name: str) -> pd.DataFrame:
         """Return one of the run's tables, if it is sound."""
@@ -106,10 +106,11 @@ class Run:
 
 
 @dataclass(frozen=True)
-class PlansOf:
-    """A run whose plans demonstrate."""
+class DrivingOf:
+    """A run that demonstrates: by its plans, by what its ego drove, or by the humans around it."""
 
     run: Run
+    kind: Kind
 
     @property
     def name(self) -> str:
@@ -117,11 +118,11 @@ class PlansOf:
         return self.run.name
 
     def examples(self, how: Cutting) -> Sequence[Example]:
-        """Take every plan that is half its own length after the one before."""
+        """Take every plan that is half its own length after the one before, or cut the tracks."""
         with tables_of(self.run.place):
-            return self._examples(how)
+            return self._plans(how) if self.kind == "plans" else self._tracks(how)
 
-    def _examples(self, how: Cutting) -> Sequence[Example]:
+    def _plans(self, how: Cutting) -> Sequence[Example]:
         run, steps = self.run, self.run.settings.horizon
         plan, horizon = run.read("plan"), run.read("horizon")
         if not len(horizon):
@@ -139,25 +140,7 @@ class PlansOf:
             raise UserError(f"{run.name}: its tables are of different runs; run it again")
         return plans(run.name, run.road, trajectory, plan, horizon, steps)
 
-
-@dataclass(frozen=True)
-class TracksOf:
-    """A run whose ego demonstrates by what it drove, or the humans around it."""
-
-    run: Run
-    kind: Kind
-
-    @property
-    def name(self) -> str:
-        """Of the run."""
-        return self.run.name
-
-    def examples(self, how: Cutting) -> Sequence[Example]:
-        """Cut the vehicles' tracks."""
-        with tables_of(self.run.place):
-            return self._examples(how)
-
-    def _examples(self, how: Cutting) -> Sequence[Example]:
+    def _tracks(self, how: Cutting) -> Sequence[Example]:
         trajectory = self.run.trajectory()
         if self.kind == "driven":
             vehicles, trajectory = {EGO}, trajectory[trajectory["visible"]]

@@ -24,6 +24,8 @@ from sumo_cohesion.planning.solvers.compiled import BUILDING
 from sumo_cohesion.planning.stage import N_STATES, StageParameters, make_stage
 from sumo_cohesion.state import BoolArray, FloatArray
 
+_LANDING = 4
+"""Numbers of a road state, where a stage leads."""
 _STAGES_AT_ONCE, _NUMBERS_AT_ONCE = 20_000, 8_000_000
 """Of many segments so much is worked out at once: less would be slower, more fills the memory."""
 
@@ -99,9 +101,6 @@ def _quadratics(segments: Segments, terms_of: Any, moved_by: Any) -> Quadratics:
     gradient[held] = gradient[held] @ z
     curvature[held] = z.swapaxes(1, 2)[:, None] @ curvature[held] @ z[:, None]
     return Quadratics(gradient, curvature, ~free, penalty.reshape(n, steps).sum(axis=1))
-
-
-_LANDING = 4
 
 
 def _lanes_of(segments: Segments, settings: PlannerSettings) -> int:
